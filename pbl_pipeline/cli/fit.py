@@ -89,7 +89,9 @@ def fit(
 
     check_out_folder(out)
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
-    sensors, recordings_of_depth = sensor_logs(imu), depth_files(depth, len(files))
+    if cameras and depth:
+        raise PblError("USAGE", "--depth with --cameras", "keypoints of one camera", "leave out --depth")
+    sensors, recordings_of_depth = sensor_logs(imu), depth_files(depth, len(files), depth_scale)
     table = _marker_set(marker_set)
     facts = _facts(len(files), video, fps, width, height, camera, person)
     trials: Sequence[Any] = [_load(path, table, up, f) for path, f in zip(files, facts, strict=True)]

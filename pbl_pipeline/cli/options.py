@@ -81,8 +81,10 @@ def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     return logs
 
 
-def depth_files(given: Sequence[str], n: int) -> list[Path | None]:
-    """Paths of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them."""
+def depth_files(given: Sequence[str], n: int, scale_m: float | None) -> list[Path | None]:
+    """Paths of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them, or a scale alone."""
+    if scale_m is not None and not given:
+        raise PblError("USAGE", "--depth-scale alone", "--depth with it", "name the folder of the depth pictures")
     if given and len(given) != n:
         raise PblError(
             "USAGE",

@@ -120,7 +120,7 @@ def run(
 
     before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
-    sensors, depths = sensor_logs(imu), depth_files(depth, len(videos))
+    sensors, depths = sensor_logs(imu), depth_files(depth, len(videos), depth_scale)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(

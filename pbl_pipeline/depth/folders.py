@@ -8,6 +8,7 @@ folders may also hold the last one, and `depth_matrix.csv` where the depth camer
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -16,8 +17,9 @@ import numpy as np
 import pandas as pd
 
 from pbl_pipeline import bounded
+from pbl_pipeline.errors import said
 
-from .recording import Depth, Pictures, depth_error
+from .recording import Depth, Pictures, check_count, depth_error
 
 #: Bytes of a picture.
 _MOST = 16 * bounded.MIB
@@ -27,19 +29,28 @@ _MATRICES = "camera_matrix.csv", "depth_matrix.csv"
 
 
 def read_folder(folder: Path, time_s: np.ndarray, size_px: tuple[int, int], scale_m: float | None) -> Depth:
-    """Read a folder of depth pictures in the order of their names. `scale_m`: metres of one step, None of Stray
-    Scanner's; `time_s` (T,): of the video's frames, which other folders have a picture for each. Raises `PblError`
-    DEPTH_FILE."""
-    inside, confidences = folder, dict[str, Path]()
+    """Read a folder of depth pictures in the order of the numbers in their names. `scale_m`: metres of one step, None
+    of Stray Scanner's; `time_s` (T,): of the video's frames, which other folders have a picture for each. Raises
+    `PblError` DEPTH_FILE."""
+    inside, confidences, stray = folder, dict[str, Path](), scale_m is None
     if scale_m is None:
         inside, scale_m = folder / "depth", 0.001
         time_s = _stray_times(folder)
         confidences = {f.stem: f for f in (folder / "confidence").glob("*.png")}
     elif not 0 < scale_m < 1000:
         raise depth_error(f"a scale of {scale_m:g} m", "metres of one step, such as 0.001", key=folder)
-    files = sorted(f for f in inside.glob("*") if f.suffix.lower() in _ENDS)
+    files = sorted((f for f in inside.glob("*") if f.suffix.lower() in _ENDS), key=_by_number)
     if not files:
         raise depth_error("no depth pictures", "a .png or .npy of each frame", key=folder)
+    if not stray:
+        check_count(len(files), len(time_s), folder)
+        time_s = time_s[: len(files)]
+    else:
+        try:  # a row of odometry.csv is a frame, which may lack its picture
+            time_s = time_s[[int(f.stem) for f in files]]
+        except (ValueError, IndexError) as error:
+            found = said("{n} depth pictures for {all} rows of odometry.csv", n=len(files), all=len(time_s))
+            raise depth_error(found, "a picture of each frame, named by its number", key=folder) from error
     matrix, own = (_matrix(folder / name) for name in _MATRICES)
     if own is not None and matrix is None:
         raise depth_error(f"{_MATRICES[1]} alone", f"{_MATRICES[0]} beside it", key=folder)
@@ -50,9 +61,18 @@ def read_folder(folder: Path, time_s: np.ndarray, size_px: tuple[int, int], scal
             if picture.dtype != np.uint16:
                 bits = f"{files[i].name} of {8 * picture.itemsize} bits ({picture.dtype})"
                 raise depth_error(bits, "16 bits a pixel, whole numbers", key=folder)
-            yield picture * scale_m, None if confidence is None else _picture(confidence)
+            sure = None if confidence is None else _picture(confidence)
+            if sure is not None and sure.shape != picture.shape:
+                found = said("confidences of {a}, depths of {b}", a=sure.shape, b=picture.shape)
+                raise depth_error(found, "pictures of one size, turned alike", key=folder)
+            yield picture * scale_m, sure
 
-    return Depth(folder, time_s[: len(files)] - time_s[0], size_px, matrix, own, read)
+    return Depth(folder, time_s - time_s[0], size_px, matrix, own, read)
+
+
+def _by_number(file: Path) -> tuple[list[int], str]:
+    """Order of pictures: that of the numbers in their names, with zeros before them or not."""
+    return [int(n) for n in re.findall(r"\d+", file.stem)], file.name
 
 
 def _stray_times(folder: Path) -> np.ndarray:

@@ -24,7 +24,7 @@ def read_depth(path: Path, time_s: np.ndarray, size_px: tuple[int, int], scale_m
     if not path.exists():
         raise PblError("FILE_MISSING", "no such file or folder", "a depth recording", "check the path", path)
     if path.is_dir():
-        return checked(read_folder(path, time, size_px, scale_m), len(time))
+        return checked(read_folder(path, time, size_px, scale_m), time)
     if scale_m is not None:
         raise depth_error("a scale for a file", "a scale for a folder of 16-bit pictures", key=path)
-    return checked(read_record3d(path, size_px), len(time))
+    return checked(read_record3d(path, size_px), time)

@@ -48,11 +48,12 @@ def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
         width, height = int(about["dw"]), int(about["dh"])
         matrix = np.array(about["K"], float).reshape(3, 3).T
         matrix[:2] *= [[size_px[0] / about["w"]], [size_px[1] / about["h"]]]
-        stamps = about.get("frameTimestamps") or np.arange(len(numbers)) / float(about["fps"])
-        members = [numbers[i] for i in sorted(numbers)]
-        time = np.array(stamps, float)[: len(members)]
-        if not members or time.ndim != 1 or len(time) < len(members):
-            raise ValueError(f"{len(members)} depths and {np.shape(stamps)} times")
+        order = sorted(numbers)
+        members = [numbers[i] for i in order]
+        stamps = np.array(about.get("frameTimestamps") or np.arange(len(members)) / float(about["fps"]), float)
+        if not members or stamps.ndim != 1 or order[-1] >= len(stamps):
+            raise ValueError(f"{len(members)} depths up to {order[-1:]} and {np.shape(stamps)} times")
+        time = stamps[order]
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, *bounded.DAMAGED) as error:
         raise depth_error(f"no recording of Record3D ({error})", "the .r3d that the app exports", key=path) from error
     return Depth(path, time - time[0], size_px, matrix, None, read)

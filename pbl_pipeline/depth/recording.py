@@ -17,8 +17,9 @@ FARTHEST_M = 5.0
 #: Typical depths (m) of a recording of a person.
 _TYPICAL_M = (0.15, 20.0)
 #: Pictures that are looked at; most of what they show that may lie beyond `FARTHEST_M`; differences of the shapes of
-#: the pictures, of the numbers of frames and of focal lengths, as fractions; of the middle of a lens, of the picture.
-_LOOKED_AT, _MOST_FAR, _SHAPE, _FEWER, _FOCAL, _MIDDLE = 5, 0.9, 0.03, 0.02, 0.05, 0.15
+#: the pictures, of the numbers of frames, of focal lengths and of durations, as fractions; of the middle of a lens, of
+#: the picture.
+_LOOKED_AT, _MOST_FAR, _SHAPE, _FEWER, _FOCAL, _LONGER, _MIDDLE = 5, 0.9, 0.03, 0.02, 0.05, 0.05, 0.06
 #: Standard deviation of a focal length that the recording states, as a fraction.
 _FOCAL_REL_SD = 0.01
 
@@ -71,21 +72,36 @@ class Depth:
         return np.rint(xy[..., ::-1]).astype(int)
 
 
-def checked(depth: Depth, n_frames: int) -> Depth:
-    """Compare a recording with a video of some frames.
-
-    Raises `PblError` DEPTH_FILE: fewer frames than the video; pictures that are turned by 90 deg or of another camera;
-    depths of nothing, in another unit than stated, or nearly all beyond `FARTHEST_M`; times that do not increase.
-    """
-    n = len(depth.time_s)
-    if n < (1 - _FEWER) * n_frames:
+def check_count(n: int, n_frames: int, path: Path, more: bool = False) -> None:
+    """Raise `PblError` DEPTH_FILE where n pictures are fewer than the frames of the video, or `more` is not allowed and
+    they are."""
+    if n < (1 - _FEWER) * n_frames or (n > (1 + _FEWER) * n_frames and not more):
         raise depth_error(
             said("{n} depth pictures for {all} of the video", n=n, all=n_frames),
             "one for each frame of the video",
-            key=depth.path,
+            key=path,
         )
+
+
+def checked(depth: Depth, time_s: np.ndarray) -> Depth:
+    """Compare a recording with a video that has frames at some times (T,).
+
+    Raises `PblError` DEPTH_FILE: fewer frames than the video; another duration; pictures that are turned by 90 deg or
+    of another camera; depths of nothing, in another unit than stated, or nearly all beyond `FARTHEST_M`; times that do
+    not increase.
+    """
+    n = len(depth.time_s)
+    check_count(n, len(time_s), depth.path, more=True)
     if not np.isfinite(depth.time_s).all() or np.any(np.diff(depth.time_s) <= 0):
         raise depth_error("times that are missing or do not increase", "seconds for each frame", key=depth.path)
+    lasts, wanted = float(depth.time_s[-1]), float(time_s[-1] - time_s[0])
+    longest = np.inf if n > (1 + _FEWER) * len(time_s) else (1 + _LONGER) * wanted  # a video may be cut at its end
+    if not (1 - _LONGER) * wanted <= lasts <= longest:
+        raise depth_error(
+            said("depths of {a:.2f} s beside a video of {b:.2f} s", a=lasts, b=wanted),
+            "a video of the same duration, joined at the rate of its recording",
+            key=depth.path,
+        )
     seen = [x for x, _ in depth.read(np.unique(np.linspace(0, n - 1, _LOOKED_AT).astype(int)).tolist())]
     if len({x.shape for x in seen}) > 1:
         raise depth_error("pictures of different sizes", "one size", key=depth.path)

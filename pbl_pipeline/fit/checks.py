@@ -162,9 +162,8 @@ def _depths(found: DepthFit | None) -> list[Check]:
     """Checks of the depths; empty if there are none."""
     if found is None:
         return []
-    had = np.isfinite(found.z)
-    used, z = float(np.min(found.used[had])), float(np.max(found.z[had]))
-    fits, ratio = float(np.min(found.fits[had])), float(found.distance[had][0])
+    used, z = float(np.nanmin(found.used)), float(np.nanmax(found.z))
+    fits, ratio = float(np.nanmin(found.fits)), float(found.distance[np.isfinite(found.distance)][0])
     return [
         Check(
             "depth_distance_ratio",

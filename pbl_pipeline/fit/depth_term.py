@@ -10,12 +10,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .keypoint_terms import in_camera
+from .problem import Depths
 from .term import At, SharedTerm, Term, Unknowns, frame_count
 
 
+def _seen(at: At) -> Depths:
+    assert at.problem.depths is not None
+    return at.problem.depths
+
+
 def _residual(at: At, x: Float[Array, "F J 3"]) -> Float[Array, "F 1 J 1"]:
-    p, seen, surface = at.problem, at.problem.depths, at.state.surface
-    assert seen is not None
+    p, seen, surface = at.problem, _seen(at), at.state.surface
     assert surface is not None
     z = in_camera(x, at.state.R_nc, p.p_nc)[:, :1, :, 2:]
     away = seen.skin_m + surface.offset_m - surface.metre * seen.depth_m
@@ -24,16 +29,14 @@ def _residual(at: At, x: Float[Array, "F J 3"]) -> Float[Array, "F 1 J 1"]:
 
 def by_surface(at: At) -> Float[Array, "F J K"]:
     """Derivatives of the residuals by the fields of `Surface`."""
-    seen = at.problem.depths
-    assert seen is not None
+    seen = _seen(at)
     frames, markers = seen.depth_m.shape
     own = jnp.broadcast_to(jnp.eye(markers), (frames, markers, markers))
     return jnp.concatenate([own, -seen.depth_m[..., None]], axis=-1) / at.weights["depth_point_sd_m"]
 
 
 def _prior(at: At) -> Array:
-    seen, surface = at.problem.depths, at.state.surface
-    assert seen is not None
+    seen, surface = _seen(at), at.state.surface
     assert surface is not None
     return 0.5 * seen.dispersion * jnp.sum((surface.offset_m / seen.offset_sd_m) ** 2) / frame_count(at.problem)
 
@@ -47,6 +50,6 @@ LDEPTH = Term(
     variables=lambda at: at.x,
     residual=_residual,
     count=lambda at: jnp.zeros(0) if at.problem.depths is None else at.problem.depths.count[:, None],
-    frames=lambda at: at.problem.weight * at.problem.depths.dispersion,
+    frames=lambda at: at.problem.weight * _seen(at).dispersion,
 )
 SURFACE = SharedTerm("surface prior", "weight_depth", _prior, empty=lambda at: at.state.surface is None)

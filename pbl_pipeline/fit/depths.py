@@ -37,7 +37,7 @@ FLOOR_LEAST_USED = 0.3
 class DepthFit:
     """The depths of N trials, as a fit found them.
 
-    `used` (N,): share of the used frames' large joints with a depth that was used; `fits` (N,): share of the depths of
+    `used` (N,): share of the used frames' large joints with a depth that was used, NaN of a trial without a recording; `fits` (N,): share of the depths of
     joints in sight that lie where the person is; `distance` (N,): distance of the fit without depths over theirs;
     `after` (N,): the same with them; `z` (N,): root mean square of their error in standard deviations; `metre`: metres
     of the fit in one of theirs.
@@ -73,7 +73,7 @@ def with_depths(
     """Add the depths to a problem, with their start by a solution without them, whose markers lie at `x`; and the
     share of each trial's that lie where the person is.
 
-    Raises `PblError` DEPTH_FILE: hardly any, or less than half of them, do.
+    Raises `PblError` DEPTH_FILE: hardly any, or less than half of those of a trial, do.
     """
     frames, markers = x.shape[:2]
     depths, seen = np.full((frames, markers, 2), np.nan), np.zeros((frames, markers), bool)
@@ -95,15 +95,19 @@ def with_depths(
     depths[~seen] = np.nan
     ratio = (z + skin)[..., None] / depths
     metre = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else np.nan
-    near = np.abs((z + skin)[..., None] - metre * depths) < MOST_OFF_M
+    near = np.asarray(np.abs((z + skin)[..., None] - metre * depths) < MOST_OFF_M)
     depth = np.where(near[..., 0], depths[..., 0], depths[..., 1])
     known, good = np.isfinite(depths).any(axis=-1), near.any(axis=-1)
-    share = np.array([_share(good[session.frames(i)], known[session.frames(i)]) for i in range(len(session.arrays))])
-    if good.sum() < max(LEAST_SHARE * known.sum(), LEAST_DEPTHS):
+    counts = np.array([(good[f].sum(), known[f].sum()) for f in map(session.frames, range(len(session.arrays)))])
+    wrong = (counts[:, 0] < LEAST_SHARE * counts[:, 1]) & (counts[:, 1] >= LEAST_DEPTHS)
+    if wrong.any() or good.sum() < LEAST_DEPTHS:
+        n, of = counts[wrong].sum(axis=0) if wrong.any() else counts.sum(axis=0)
         raise depth_error(
-            said("{n} of {all} depths at the person's joints within 0.3 m of them", n=good.sum(), all=known.sum()),
+            said("{n} of {all} depths at the person's joints within 0.3 m of them", n=n, all=of),
             "most of them: a depth recording of this video, upright and not mirrored, within 5 m",
+            key=", ".join(np.array(session.names)[wrong]),
         )
+    share = np.array([n / of if of else np.nan for n, of in counts])
     sds = [next((sd for k, sd in SKIN_SD_M.items() if n.startswith(k)), OTHER_SD_M) for n in names]
     values: dict[str, Any] = {
         "depth_m": np.where(good, depth, 0),
@@ -112,19 +116,15 @@ def with_depths(
         "offset_sd_m": np.pad(sds, (0, markers - len(sds)), constant_values=OTHER_SD_M),
         "dispersion": dispersion,
     }
-    packed = Depths(**{k: np.asarray(v, np.float32) for k, v in values.items()})
+    packed: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in values.items()}
     own: Any = np.zeros(markers, np.float32), np.asarray(metre, np.float32)
-    return dataclasses.replace(p, depths=packed), dataclasses.replace(start, surface=Surface(*own)), share
+    return dataclasses.replace(p, depths=Depths(**packed)), dataclasses.replace(start, surface=Surface(*own)), share
 
 
 def _large(session: Session) -> np.ndarray:
     """(J,) bool: markers that are used."""
     named = [not n.startswith(LEFT_OUT) for n in session.markers.body_names]
     return np.array(named) & (np.asarray(session.markers.weight_3d) > 0)
-
-
-def _share(some: np.ndarray, of: np.ndarray) -> float:
-    return float(some.sum() / of.sum()) if of.any() else np.nan
 
 
 def shares_of_floors(session: Session, p: Problem) -> Float[np.ndarray, "F Q"]:
@@ -158,7 +158,7 @@ def depth_fit(
         at = session.frames(i)
         n, e = count[at], error[at][count[at]]
         if not n.any():
-            rows.append((0.0, share[i], np.nan, np.nan, np.nan))
+            rows.append((np.nan if session.depths[i] is None else 0.0, share[i], np.nan, np.nan, np.nan))
             continue
         after = float(np.median((z + skin)[at][n] / (metre * depth[at][n])))
         rows.append((n.sum() / (arrays.used.sum() * joints), share[i], before, after, np.sqrt(np.mean(e**2))))

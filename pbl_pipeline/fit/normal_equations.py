@@ -133,7 +133,7 @@ def _columns_of(state: State, moving: bool) -> _Columns:
     sizes = [sum(a.size for a in jax.tree.leaves(part)) for part in _shared_parts(state, moving)]
     ends = np.cumsum(sizes).tolist()
     places = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    return _Columns(*places, state.qpos.shape[1] + 3 * moving, ends[-1])
+    return _Columns._make([*places, state.qpos.shape[1] + 3 * moving, ends[-1]])
 
 
 def _shared_parts(state: State, moving: bool) -> tuple[Any, ...]:

@@ -33,7 +33,8 @@ def worn(logs: Sequence[SensorLog], clock_s: Sequence[Stated] | None, n_trials: 
     twice = sorted({s for s in segments if segments.count(s) > 1})
     if unknown or twice:
         raise input_error(f"sensors on {', '.join(unknown or twice)}", f"each once: {', '.join(SEGMENTS)}")
-    clocks: list[Stated] = [0.0 if n_trials == 1 else None] * n_trials if clock_s is None else list(clock_s)
+    stated = [0.0 if n_trials == 1 else None] * n_trials if clock_s is None else clock_s
+    clocks: list[Stated] = [c if c is None or isinstance(c, tuple) else float(c) for c in stated]
     if len(clocks) != n_trials:
         raise input_error(said("{n} clocks of sensors", n=len(clocks)), said("one for each of {n} trials", n=n_trials))
     return Worn(tuple(oriented(log) for log in logs), tuple(clocks))

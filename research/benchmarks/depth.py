@@ -61,7 +61,7 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
     synth.NOISES["benchmark"] = BLAZEPOSE_HEAVY_MEASURED
     camera.MIDDLE_M, camera.NEAREST_M = MIDDLE_M, NEAREST_M
     made = synthesise(SynthSpec(view=view, seconds=2.5, marker_set="blazepose_33", seed=seed))
-    recording = checked(depth_recording(made.truth, made.keypoints, seed), len(made.truth.time_s))
+    recording = checked(depth_recording(made.truth, made.keypoints, seed), made.truth.time_s)
     depths, out = at_points(recording, made.keypoints), {}
     for name, given in (("video", None), ("depth", depths)):
         begin = time.process_time()
@@ -70,8 +70,8 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
         error, within = errors(fit, made.truth)
         path = pelvis_path(load_body(), np.asarray(fit.trials[0].qpos, float))[0]
         ratio = np.linalg.norm(path, axis=1) / np.linalg.norm(made.truth.pelvis_m, axis=1)
-        found = (np.nan, np.nan) if fit.depth is None else (fit.depth.used[0], fit.depth.z[0])
-        out[name] = Walk(error, within, float(np.nanmedian(ratio)), *map(float, found), seconds)
+        used, z = (np.nan, np.nan) if fit.depth is None else (float(fit.depth.used[0]), float(fit.depth.z[0]))
+        out[name] = Walk(error, within, float(np.nanmedian(ratio)), used, z, seconds)
     return out
 
 

@@ -17,6 +17,7 @@ from pbl_pipeline.body import capsules, load_body, ray_lengths
 from pbl_pipeline.cli.fit import _with_depths
 from pbl_pipeline.cli.options import depth_files
 from pbl_pipeline.depth import Depth, at_points, read_depth
+from pbl_pipeline.depth.folders import read_folder
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import GaussNewtonParams, fit_session
 from pbl_pipeline.fit.checks import _depths
@@ -114,6 +115,7 @@ def test_each_format(tmp_path: Path, form: str):
     ("picture", "n", "scale", "found"),
     [
         (millimetres, 8, 0.001, "8 depth pictures for 12"),
+        (lambda i: millimetres(i % N), 2 * N, 0.001, "24 depth pictures for 12"),
         (lambda i: np.rot90(millimetres(i)).copy(), N, 0.001, "24x32, turned by 90 deg,"),
         (lambda i: millimetres(i)[:, :24].copy(), N, 0.001, "of another camera"),
         (lambda i: np.zeros((HEIGHT, WIDTH), np.uint16), N, 0.001, "depths of 0"),
@@ -137,15 +139,34 @@ def test_bad_recordings_are_named(tmp_path: Path):
     stray_rows = "timestamp\n" + "".join(f"{t}\n" for t in TIME_S)
     (folder / "odometry.csv").write_text(stray_rows)
     assert "its middle at 960, 720 px" in refused(folder).found
+    (folder / "camera_matrix.csv").write_text("500, 0, 384\n0, 500, 288\n0, 0, 1\n")  # of 768x576 beside 640x480
+    assert "its middle at 384, 288 px" in refused(folder).found
     (folder / "odometry.csv").write_text(stray_rows.replace("7.0", "9.0", 1))
     (folder / "camera_matrix.csv").unlink()
     assert "do not increase" in refused(folder).found
+    (folder / "odometry.csv").write_text("timestamp\n" + "".join(f"{2 * t}\n" for t in TIME_S))
+    assert "0.73 s beside a video of 0.37 s" in refused(folder).found
+    (folder / "odometry.csv").write_text(stray_rows)
+    write(folder / "confidence", lambda i: np.full((WIDTH, HEIGHT), 2, np.uint8))
+    assert "confidences of (32, 24)" in refused(folder).found
     with pytest.raises(PblError, match="FILE_MISSING"):
         read_depth(tmp_path / "nothing", TIME_S, SIZE_PX)
     pytest.importorskip("lzfse")
     (tmp_path / "c.r3d").write_bytes(b"no zip")
     assert "Record3D" in refused(tmp_path / "c.r3d").found
     assert "0.depth" in refused(record3d(tmp_path / "d.r3d", wrong=b"damaged")).found
+
+
+def test_pictures_are_paired_by_their_numbers(tmp_path: Path):
+    folder = write(tmp_path / "a", millimetres)
+    for i in range(N):
+        (folder / f"{i:06d}.png").rename(folder / f"depth_{i}.png")
+    (depth, _) = next(read_depth(folder, TIME_S, SIZE_PX, 0.001).read([11]))
+    np.testing.assert_allclose(depth, depths(11), atol=1e-3)
+    # A frame of Stray Scanner without its picture.
+    (stray(tmp_path / "b") / "depth" / "000003.png").unlink()
+    found = read_folder(tmp_path / "b", TIME_S, SIZE_PX, None)
+    np.testing.assert_allclose(found.time_s, np.delete(TIME_S - TIME_S[0], 3), atol=1e-4)
 
 
 def test_cameras_with_other_views_are_registered_by_their_matrices(tmp_path: Path):
@@ -205,7 +226,7 @@ def test_rays_meet_capsules():
     assert hits > 30
 
 
-def filmed(metre: float = 1.0):
+def filmed(metre: float = 1.0) -> Any:
     """A walk with exact keypoints whose fit is in other metres than the depths; its session and solution."""
     made = synthesise(SynthSpec(view="frontal", seconds=1.5, marker_set="blazepose_33", seed=511, noise="none"))
     truth, body = made.truth, load_body()
@@ -248,6 +269,24 @@ def test_depths_on_the_way_into_a_fit(monkeypatch: pytest.MonkeyPatch):
         with_depths(dataclasses.replace(session, depths=(away,)), session.problem, state, x, 0.5)
 
 
+def test_the_trial_with_a_wrong_recording_is_named():
+    """The depths of two trials are right, those of one are another's."""
+    made, *_, x, depth = filmed()
+    n, q = len(depth), made.truth.qpos
+    session = make_session([made.keypoints] * 3, ["a", "b", "c"], GaussNewtonParams())
+    state, at = start_of(session), [session.frames(i) for i in range(3)]
+    qpos, markers = np.array(state.qpos), np.zeros((len(state.qpos), *x.shape[1:]))
+    for i in range(3):
+        qpos[at[i]][:n], markers[at[i]][:n] = q, x[:n]
+    state: Any = dataclasses.replace(state, qpos=qpos, R_nc=np.asarray(state.R_nc))
+    away = np.broadcast_to(np.linspace(1, 4.5, n)[:, None, None], depth.shape)
+    args: Any = session.problem, state, markers, 0.5
+    *_, share = with_depths(dataclasses.replace(session, depths=(depth, None, depth)), *args)
+    assert np.isnan(share[1])
+    with pytest.raises(PblError, match=r"about: +b\n"):
+        with_depths(dataclasses.replace(session, depths=(depth, away, depth)), *args)
+
+
 def test_depths_of_other_trials_are_refused():
     made, session, *_, depth = filmed()
     assert check_depths((None,), session.trials) == ()
@@ -271,6 +310,7 @@ def test_depths_of_other_trials_are_refused():
 def test_checks_of_depths(changed: dict[str, float], name: str, outcome: str):
     good = {"used": 0.5, "fits": 0.95, "distance": 0.92, "after": 1.0, "z": 1.1}
     values = {k: np.array([v]) for k, v in (good | changed).items()}
+    values |= {k: np.append(values[k], np.nan) for k in good}  # a trial without a recording
     checks = _depths(DepthFit(**values, metre=1.0))
     assert [(c.check, c.outcome) for c in checks if c.outcome != PASS] == ([(name, outcome)] if name else [])
     assert _depths(None) == []
@@ -306,8 +346,10 @@ def test_keypoints_take_the_camera_and_the_depths_of_a_recording(tmp_path: Path)
     assert set(depth[np.isfinite(depth)]) == {3.0}
     assert depth.shape == (*made.confidence.shape, 2)
     assert _with_depths([made], [None], None) == ([made], [])
-    assert depth_files(["none", "b"], 2) == [None, Path("b")]
+    assert depth_files(["none", "b"], 2, 0.001) == [None, Path("b")]
     with pytest.raises(PblError, match="USAGE"):
-        depth_files(["b"], 2)
+        depth_files(["b"], 2, None)
+    with pytest.raises(PblError, match="USAGE"):
+        depth_files([], 2, 0.001)
     with pytest.raises(PblError, match="USAGE"):
         _with_depths([SimpleNamespace(markers="of a laboratory")], [folder], 0.001)
