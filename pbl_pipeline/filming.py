@@ -28,9 +28,9 @@ class Filming:
 
     views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: codes or
     words as stated of the visit, "none" where it is stated that there was none; paces: of the walks; height: whether
-    the body height was stated ("stated" or "not_stated"); cameras: kinds of sources of the intrinsics
-    (`video.CAMERA_KINDS`); pictures: classes of the size of the picture, such as "1080p"; far_leg: the leg behind the
-    other in most cycles (`gait.far_leg_of`).
+    the body height was stated ("stated" or "not_stated"), or "depths", which set the scale then; cameras: kinds of
+    sources of the intrinsics (`video.CAMERA_KINDS`); pictures: classes of the size of the picture, such as "1080p";
+    far_leg: the leg behind the other in most cycles (`gait.far_leg_of`).
     """
 
     views: tuple[str, ...] = ()

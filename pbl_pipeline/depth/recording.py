@@ -19,7 +19,7 @@ _TYPICAL_M = (0.15, 20.0)
 #: Pictures that are looked at; most of what they show that may lie beyond `FARTHEST_M`; differences of the shapes of
 #: the pictures, of the numbers of frames, of focal lengths and of durations, as fractions; of the middle of a lens, of
 #: the picture.
-_LOOKED_AT, _MOST_FAR, _SHAPE, _FEWER, _FOCAL, _LONGER, _MIDDLE = 5, 0.9, 0.03, 0.02, 0.05, 0.05, 0.06
+_LOOKED_AT, _MOST_FAR, _SHAPE, _FEWER, _FOCAL, _LONGER, _MIDDLE = 5, 0.9, 0.03, 0.02, 0.05, 0.03, 0.06
 #: Standard deviation of a focal length that the recording states, as a fraction.
 _FOCAL_REL_SD = 0.01
 
@@ -84,7 +84,8 @@ def check_count(n: int, n_frames: int, path: Path, more: bool = False) -> None:
 
 
 def checked(depth: Depth, time_s: np.ndarray) -> Depth:
-    """Compare a recording with a video that has frames at some times (T,).
+    """Compare a recording with a video that has frames at some times (T,); returns it, with these times if it has as
+    many frames: both apps write one of each.
 
     Raises `PblError` DEPTH_FILE: fewer frames than the video; another duration; pictures that are turned by 90 deg or
     of another camera; depths of nothing, in another unit than stated, or nearly all beyond `FARTHEST_M`; times that do
@@ -122,7 +123,7 @@ def checked(depth: Depth, time_s: np.ndarray) -> Depth:
             "a person nearer to the camera",
             key=depth.path,
         )
-    return depth
+    return dataclasses.replace(depth, time_s=time_s - time_s[0]) if n == len(time_s) else depth
 
 
 def _check_picture(depth: Depth, height: int, width: int) -> None:

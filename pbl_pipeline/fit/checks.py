@@ -16,6 +16,7 @@ from pbl_pipeline.results import SensorFit
 from .augmented_pelvis import folds
 from .depths import DepthFit
 from .initial_pose import pelvis_path
+from .problem import CLOCK_RANGE_S
 from .results import SD_WARN_DEG, TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
 from .solution import Solution
@@ -148,10 +149,10 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
             "a person who hardly moves does not show how the sensors sit, nor their clock: they add next to nothing",
         ),
         warn_if(
-            off > 0,
+            off > CLOCK_RANGE_S,  # by which the fit moves a clock
             "sensor_wall_clock_s",
             off,
-            0.0,
+            CLOCK_RANGE_S,
             f"by its movement a video lies {off:.0f} s from where its time of recording is in the log of the sensors; "
             "set the clocks of phone and sensors, or name the log of this recording",
         ),

@@ -37,10 +37,10 @@ FLOOR_LEAST_USED = 0.3
 class DepthFit:
     """The depths of N trials, as a fit found them.
 
-    `used` (N,): share of the used frames' large joints with a depth that was used, NaN of a trial without a recording; `fits` (N,): share of the depths of
-    joints in sight that lie where the person is; `distance` (N,): distance of the fit without depths over theirs;
-    `after` (N,): the same with them; `z` (N,): root mean square of their error in standard deviations; `metre`: metres
-    of the fit in one of theirs.
+    `used` (N,): share of the used frames' large joints with a depth that was used, NaN without a recording; `fits`
+    (N,): share of the depths of joints in sight that lie where the person is; `distance` (N,): distance of the fit
+    without depths over theirs; `after` (N,): the same with them; `z` (N,): root mean square of their error in standard
+    deviations; `metre`: metres of the fit in one of theirs.
     """
 
     used: np.ndarray

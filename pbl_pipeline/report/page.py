@@ -70,7 +70,8 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str)
         "key_time": _figures.legend("left", "right", "stance"),
         "event_methods": [] if metrics is None else list(dict.fromkeys(t.events.method for t in metrics.trials)),
         "scale_assumed": any(
-            r.fit is not None and r.fit.orientation_source != "measured: calibration" for r in visit.fitted
+            r.fit is not None and not r.fit.sized and r.fit.orientation_source != "measured: calibration"
+            for r in visit.fitted
         ),
         "norm": norm,
         "origin": _origin(visit, recordings, norm),

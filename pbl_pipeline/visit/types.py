@@ -171,7 +171,7 @@ class Visit:
         return Filming(
             views=views_of((r.name, c.far_leg) for r in pooled for c in r.cycles if c.used) if one_camera else (),
             paces=known(r.condition.pool for r in pooled),
-            height=known(height_word(f.height_m) for f in fits),
+            height=known("depths" if f.with_depths else height_word(f.height_m) for f in fits),
             cameras=known(f.camera.kind for f in fits) if one_camera else (),
             pictures=known(picture_class(*f.image_size_px) for f in fits) if one_camera else (),
             far_leg=far_leg_of([c for r in pooled for c in r.cycles]),

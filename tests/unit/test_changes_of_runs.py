@@ -54,6 +54,9 @@ def test_a_change_is_judged_as_on_the_pages(visit):
     row = visit_changes(filmed, before)[0]
     assert (row["verdict"], row["least"]) == ("cannot be judged", None)
     assert row["not_comparable"] == "height (stated, before: not_stated)"
+    other = dataclasses.replace(visit.recordings[0].fit, with_depths=True)
+    filmed = dataclasses.replace(now, recordings=(Recording.of("walk", other).with_measured(visit.measures.trials[0]),))
+    assert visit_changes(filmed, before)[0]["not_comparable"] == "height (depths, before: not_stated)"
 
 
 def test_gait_compares_with_a_folder_and_writes_it(folders):

@@ -146,7 +146,9 @@ def test_bad_recordings_are_named(tmp_path: Path):
     assert "do not increase" in refused(folder).found
     (folder / "odometry.csv").write_text("timestamp\n" + "".join(f"{2 * t}\n" for t in TIME_S))
     assert "0.73 s beside a video of 0.37 s" in refused(folder).found
-    (folder / "odometry.csv").write_text(stray_rows)
+    (folder / "odometry.csv").write_text("timestamp\n" + "".join(f"{1.02 * t}\n" for t in TIME_S))
+    (folder / "camera_matrix.csv").unlink(missing_ok=True)
+    np.testing.assert_array_equal(read_depth(folder, TIME_S, SIZE_PX).time_s, TIME_S - TIME_S[0])  # frame by frame
     write(folder / "confidence", lambda i: np.full((WIDTH, HEIGHT), 2, np.uint8))
     assert "confidences of (32, 24)" in refused(folder).found
     with pytest.raises(PblError, match="FILE_MISSING"):

@@ -83,6 +83,10 @@ def test_a_log_without_samples_is_refused_and_a_segment_twice_too():
     with pytest.raises(PblError, match="FIT_INPUT"):
         worn([log], [0.0, 0.0], 1)
     assert worn([], None, 1) is None
+    stated = worn([log], [2, (1.0, 5.0), None], 3)
+    assert stated is not None
+    assert stated.clock_s == (2.0, (1.0, 5.0), None)
+    assert isinstance(stated.clock_s[0], float)  # not looked for in the whole log
 
 
 @pytest.mark.parametrize("stated", [0.0, None])
@@ -217,6 +221,7 @@ def fitted(**more) -> SensorFit:
         ({"bias_rad_s": np.array([0.0, -0.1, 0.0])}, "sensor_bias", WARN),
         ({"rate_rad_s": 0.1}, "sensor_rate", WARN),
         ({"off_s": -40.0}, "sensor_wall_clock_s", WARN),
+        ({"off_s": 0.3}, "", PASS),  # "0 s" off
     ],
 )
 def test_what_is_wrong_is_said(more, check, outcome):
