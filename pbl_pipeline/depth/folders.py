@@ -30,7 +30,7 @@ _MATRICES = "camera_matrix.csv", "depth_matrix.csv"
 
 def read_folder(folder: Path, time_s: np.ndarray, size_px: tuple[int, int], scale_m: float | None) -> Depth:
     """Read a folder of depth pictures in the order of the numbers in their names. `scale_m`: metres of one step, None
-    of Stray Scanner's; `time_s` (T,): of the video's frames, which other folders have a picture for each. Raises
+    of Stray Scanner's; `time_s` (T,): of the video's frames from 0 on, for each of which other folders have a picture. Raises
     `PblError` DEPTH_FILE."""
     inside, confidences, stray = folder, dict[str, Path](), scale_m is None
     if scale_m is None:
@@ -67,7 +67,7 @@ def read_folder(folder: Path, time_s: np.ndarray, size_px: tuple[int, int], scal
                 raise depth_error(found, "pictures of one size, turned alike", key=folder)
             yield picture * scale_m, sure
 
-    return Depth(folder, time_s - time_s[0], size_px, matrix, own, read)
+    return Depth(folder, time_s, size_px, matrix, own, read)
 
 
 def _by_number(file: Path) -> tuple[list[int], str]:
@@ -84,7 +84,7 @@ def _stray_times(folder: Path) -> np.ndarray:
     except (OSError, ValueError, KeyError, TypeError) as error:
         expected = "a folder of Stray Scanner with odometry.csv, or the scale of the folder's 16-bit pictures"
         raise depth_error(f"no recording of Stray Scanner ({error})", expected, key=folder) from error
-    return time
+    return time - time[0]
 
 
 def _matrix(file: Path) -> np.ndarray | None:

@@ -53,7 +53,6 @@ def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
         stamps = np.array(about.get("frameTimestamps") or np.arange(len(members)) / float(about["fps"]), float)
         if not members or stamps.ndim != 1 or order[-1] >= len(stamps):
             raise ValueError(f"{len(members)} depths up to {order[-1:]} and {np.shape(stamps)} times")
-        time = stamps[order]
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, *bounded.DAMAGED) as error:
         raise depth_error(f"no recording of Record3D ({error})", "the .r3d that the app exports", key=path) from error
-    return Depth(path, time - time[0], size_px, matrix, None, read)
+    return Depth(path, stamps[order] - stamps[0], size_px, matrix, None, read)

@@ -97,7 +97,7 @@ def with_depths(
     metre = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else np.nan
     near = np.asarray(np.abs((z + skin)[..., None] - metre * depths) < MOST_OFF_M)
     depth = np.where(near[..., 0], depths[..., 0], depths[..., 1])
-    known, good = np.isfinite(depths).any(axis=-1), near.any(axis=-1)
+    known, good = np.isfinite(depths).max(axis=-1), near.max(axis=-1)
     counts = np.array([(good[f].sum(), known[f].sum()) for f in map(session.frames, range(len(session.arrays)))])
     wrong = (counts[:, 0] < LEAST_SHARE * counts[:, 1]) & (counts[:, 1] >= LEAST_DEPTHS)
     if wrong.any() or good.sum() < LEAST_DEPTHS:
