@@ -30,8 +30,8 @@ _MATRICES = "camera_matrix.csv", "depth_matrix.csv"
 
 def read_folder(folder: Path, time_s: np.ndarray, size_px: tuple[int, int], scale_m: float | None) -> Depth:
     """Read a folder of depth pictures in the order of the numbers in their names. `scale_m`: metres of one step, None
-    of Stray Scanner's; `time_s` (T,): of the video's frames from 0 on, for each of which other folders have a picture. Raises
-    `PblError` DEPTH_FILE."""
+    of Stray Scanner's; `time_s` (T,): of the video's frames from 0 on, each of which has a picture in other folders.
+    Raises `PblError` DEPTH_FILE."""
     inside, confidences, stray = folder, dict[str, Path](), scale_m is None
     if scale_m is None:
         inside, scale_m = folder / "depth", 0.001
