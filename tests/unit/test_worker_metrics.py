@@ -343,6 +343,8 @@ def test_where_the_device_fails_the_process_ends_and_the_job_is_left_to_another(
     error = refused("DEVICE_UNAVAILABLE", run_job.run, job)
     assert error.found == "INTERNAL: CUDA error: device lost"
     assert counted == [(job, error.found)]
+    other = jax.errors.JaxRuntimeError("INVALID_ARGUMENT: shapes differ")
+    assert not run_job.device_failure(other)  # the next device would meet it too: an error row
 
 
 def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):
