@@ -13,7 +13,7 @@ from pbl_pipeline.body import body_frames, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit, fit_session
 from pbl_pipeline.fit.checks import _sensors
-from pbl_pipeline.fit.wearables import floor_shares, shares_of_floors
+from pbl_pipeline.fit.wearables import FLOOR_SHARES, floor_shares, shares_of_floors
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import FAIL, PASS, WARN
 from pbl_pipeline.records import plain
@@ -242,7 +242,9 @@ def test_what_is_wrong_is_said(more, check, outcome):
 def test_least_standard_deviations_fall_where_both_segments_have_sensors():
     names = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "ankle_angle_r", "lumbar_bending")
     shares = floor_shares(names, ["pelvis", "thigh_r", "shank_r"])
-    assert shares.tolist() == [0.7, 0.8, 0.53, 0.78, 1.0]
+    hip, knee, ankle = (FLOOR_SHARES[name][1] for name in ("hip_flexion", "knee_", "ankle_"))
+    assert shares.tolist() == [hip[2], hip[1], knee[2], ankle[1], 1.0]
+    assert all(np.all(np.diff(of) < 0) for _, of in FLOOR_SHARES.values())
 
 
 def test_a_sensor_that_measured_nothing_in_a_trial_leaves_its_floors():
@@ -257,7 +259,8 @@ def test_a_sensor_that_measured_nothing_in_a_trial_leaves_its_floors():
         frames=lambda i: slice(i * n, (i + 1) * n),
     )
     problem: Any = SimpleNamespace(wearables=SimpleNamespace(count=count))
-    assert shares_of_floors(session, problem)[:, 0].tolist() == [0.53] * n + [0.75] * n
+    _, (_, one, both) = FLOOR_SHARES["knee_"]
+    assert shares_of_floors(session, problem)[:, 0].tolist() == [both] * n + [one] * n
 
 
 def part(whole: Keypoints, at: slice) -> Keypoints:
