@@ -18,7 +18,8 @@ REPORT_NAMES = (
     r"demo|sports2d-demo|\bwalk(\.mp4)?\b|blazepose\S*|\S+-transformer\S*|gillette\S*|gauss-newton|pbl-\S+|PBL\S* \S+"
     r"|[A-Za-z]\w*\.\w+|Gillette Children's Specialty Healthcare|MIT \(c\)"
     r"|Gait (&|Deviation Index|Profile Score)|cpu"
-    r"|The effect of walking speed on the gait of typically .* children|Plug-in Gait|\[\w+\]|Kalman|GDI|SHA-256|\d+\.\d+\.\d+\+g[0-9a-f]+"
+    r"|The effect of walking speed on the gait of typically .* children|Plug-in Gait|\[\w+\]|Kalman|GDI|SHA-256"
+    r"|\d+\.\d+\.\d+\+g[0-9a-f]+"
 )
 
 
