@@ -137,7 +137,8 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
     from pbl_schemas.tracking import drop_outdated_choices
 
     out, tables = Refreshed(), chain.computed_tables()
-    for table in tables:
+    in_use = queue.having(dict.fromkeys(tables, "TRUE"))  # the others have nothing to free or sweep
+    for table in in_use:
         out.freed += recover.free_dead(table)
     if not own:
         out.dropped = Counter(drop_outdated_choices())
@@ -147,9 +148,10 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
             out.queued += Counter({table.__name__: out.planned})
         where = None if scope is None else scope.where(table)
         if where is not None or scope is None:
-            out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
+            if table in in_use:
+                out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
             out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
-        elif not own:
+        elif not own and table in in_use:
             out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go immediately
     return out
 

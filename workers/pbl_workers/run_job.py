@@ -137,10 +137,9 @@ class _Attempt:
     def make(self) -> str:
         """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any longer); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
-        if key in table:
-            return ALREADY
-        if not _is_wanted(self.job):
-            return VANISHED
+        there, wanted = _there_and_wanted(self.job)
+        if there or not wanted:
+            return ALREADY if there else VANISHED
         if self.computed is not None:
             with contextlib.suppress(InputChanged):  # then it is computed again
                 self._insert(table, key, self.computed)
@@ -166,9 +165,12 @@ class _Attempt:
                 raise
 
 
-def _is_wanted(job: Claim) -> bool:
-    """Return whether the key can still be computed: its rows above exist, and it is still requested."""
-    return bool(keys_of(job.table) & job.key)
+def _there_and_wanted(job: Claim) -> tuple[bool, bool]:
+    """Return whether the result is there, and whether its key can still be computed: its rows above exist, and it is
+    still requested."""
+    exist = (f"EXISTS ({(rows & job.key).make_sql()})" for rows in (job.table, keys_of(job.table)))
+    there, wanted = job.table.connection.query(f"SELECT {', '.join(exist)}").fetchone()
+    return bool(there), bool(wanted)
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
@@ -190,7 +192,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
     if isinstance(error, IntegrityError):  # a row above was deleted while we computed
         error = InputChanged(f"a row that the result refers to is gone ({error})", job)
     if isinstance(error, InputChanged):
-        if not _is_wanted(job):
+        if not _there_and_wanted(job)[1]:
             queue.finish(job)
             return Outcome(job, VANISHED)
         tried = job.attempts + 1
