@@ -64,6 +64,7 @@ CODES: dict[str, Code] = {
     "CALIBRATION_POOR": Code(INPUT, "the views of the board do not determine the lens"),
     "PHONE_LOG": Code(INPUT, "the orientation log of the phone is not usable"),
     "SENSOR_LOG": Code(INPUT, "the log of a wearable sensor is not usable"),
+    "DEPTH_FILE": Code(INPUT, "the depth recording is not usable"),
     "FIT_INPUT": Code(INPUT, "the keypoints cannot be fitted: too few frames, time stamps out of order, nothing seen"),
     "VIEWS_DISAGREE": Code(INPUT, "the cameras of a trial do not see one person where the calibration says"),
     "AUGMENTER_INPUT": Code(INPUT, "the points do not suffice to predict anatomical markers"),

@@ -8,7 +8,7 @@ from types import ModuleType
 from pbl_pipeline.errors import PblError
 
 #: Module of an optional package -> the extra that brings it.
-EXTRAS = {"ezc3d": "export", "pyarrow": "export", "matplotlib": "figures", "h5py": "h5"}
+EXTRAS = {"ezc3d": "export", "pyarrow": "export", "matplotlib": "figures", "h5py": "h5", "lzfse": "depth"}
 
 
 def needed(module: str, purpose: str) -> ModuleType:

@@ -8,9 +8,13 @@ import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pbl_pipeline import progress
 from pbl_pipeline.deidentify import to_show
+from pbl_pipeline.depth import at_points, read_depth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import METHODS as FIT_METHODS
@@ -52,6 +56,8 @@ def run_visit(
     mass_kg: float | None = None,
     activity: str | None = None,
     sensors: Sequence[SensorLog] = (),
+    depth_files: Sequence[Path | None] = (),
+    depth_scale_m: float | None = None,
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -62,7 +68,9 @@ def run_visit(
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`;
     `mass_kg`: as in `visit_kinetics`. `activity`: what the person does in the videos; None: unknown, which counts
-    as walking. `sensors`: logs of the wearable sensors of the visit, as `read_given` returns them.
+    as walking. `sensors`: logs of the wearable sensors of the visit, as `read_given` returns them. `depth_files`: of
+    each video, None where there is none; one that does not belong to its video leaves that out; `depth_scale_m`: as in
+    `read_depth`.
 
     Raises the error of the video where no video of the visit can be fitted: the VIDEO_ codes,
     TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes, CAMERA_INVALID, MODEL_
@@ -81,8 +89,10 @@ def run_visit(
     problems: dict[str, PblError] = {}
     seen: dict[str, str] = {}
     inputs = []
-    for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
+    depths = depth_files or [None] * len(paths)
+    for path, name, log, depth in zip(paths, distinct_names(paths), logs, depths, strict=True):
         one = _Input(path, name, log, out, camera_file, person, people.paramset, keypoints.paramset, method.paramset)
+        one = dataclasses.replace(one, depth=depth, depth_scale_m=depth_scale_m)
         try:
             first = seen.setdefault(sha256_of(check_file(path)), name)
             if first != name:
@@ -91,8 +101,10 @@ def run_visit(
             one = dataclasses.replace(one, error=error)
         inputs.append(one)
     found: list[Recording] = []
-    for one, (recording, error) in zip(inputs, _side_by_side(inputs), strict=True):
+    depths = list[np.ndarray | None]()
+    for one, (recording, error, depth) in zip(inputs, _side_by_side(inputs), strict=True):
         found.append(dataclasses.replace(recording, condition=condition))
+        depths += [] if recording.problem else [depth]
         if error is not None:
             problems[one.name] = error
     recordings = [r for r in found if not r.problem]
@@ -101,7 +113,10 @@ def run_visit(
     check_day(sensors, {r.name: r.video.recorded_utc for r in recordings if r.video is not None})
     points = [r.keypoints for r in recordings if r.keypoints is not None]
     recorded = [None if r.video is None else r.video.recorded_utc for r in recordings]
-    more = {"sensors": sensors, "sensor_clock_s": places(sensors, recorded, points)} if sensors else {}
+    more: dict[str, Any] = {}
+    if sensors:
+        more = {"sensors": sensors, "sensor_clock_s": places(sensors, recorded, points)}
+    more |= {"depths": depths} if any(d is not None for d in depths) else {}
     fit = fit_session(
         points,
         [r.name for r in recordings],
@@ -131,9 +146,15 @@ class _Input:
     keypoints: Paramset
     fit: Paramset
     error: PblError | None = None
+    depth: Path | None = None
+    depth_scale_m: float | None = None
 
 
-def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblError | None]]:
+#: Keypoints of a video with the error that leaves it out, and the depths at them.
+_Output = tuple[Recording, PblError | None, np.ndarray | None]
+
+
+def _side_by_side(inputs: Sequence[_Input]) -> Iterator[_Output]:
     """Detect in each video, in order: in several processes if a GPU computes the networks, else in this one, whose
     threads use the cores."""
     videos = sum(i.error is None for i in inputs)
@@ -147,14 +168,18 @@ def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblErro
 
 
 @frames_kept()
-def _detected(one: _Input) -> tuple[Recording, PblError | None]:
-    """Keypoints of a video, checked, or the error that leaves it out."""
-    video = choice = None
+def _detected(one: _Input) -> _Output:
+    """Keypoints of a video, checked, with the depths at them, or the error that leaves it out."""
+    video = choice = depth = None
     try:
         if one.error is not None:
             raise one.error
         video = probe(one.path)
         camera = find_camera(video, one.camera_file)
+        if one.depth is not None:
+            size = video.width_px, video.height_px
+            depth = read_depth(one.depth, np.asarray(video.time_s), size, one.depth_scale_m)
+            camera = depth.camera(camera)
         tracking = track_people(one.path, one.people, info=video)
         choice = choose_subject(tracking, override=one.person)
         subject = require_subject(choice, tracking, one.path, one.out / f"{one.name}.persons.png")
@@ -162,10 +187,11 @@ def _detected(one: _Input) -> tuple[Recording, PblError | None]:
         if one.log is not None:
             points = points.with_attitude(attitude_of(one.log[1], one.log[0], video))
         check_trial(points, one.name, one.fit)
-        return Recording.of(one.name, keypoints=points, path=one.path, video=video, choice=choice), None
+        depths = None if depth is None else at_points(depth, points)
+        return Recording.of(one.name, keypoints=points, path=one.path, video=video, choice=choice), None, depths
     except PblError as error:
         problem = choice.reason if choice is not None and choice.person_id is None else error.short()
-        return Recording(one.name, one.path, video, choice, problem=problem), error
+        return Recording(one.name, one.path, video, choice, problem=problem), error, None
 
 
 def measured(

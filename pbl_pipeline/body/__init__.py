@@ -16,6 +16,7 @@ from pbl_pipeline.body._capsules import (  # noqa: E402
     body_frames,
     capsule_shapes,
     capsules,
+    ray_lengths,
     scaled_model,
     stature_m,
 )

@@ -69,6 +69,30 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
     )
 
 
+def ray_lengths(shapes: Capsules, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """Lengths (T, R, G), in units of the rays (T, R, 3), from origins (T, 3) to the first point of each capsule on
+    them; infinite where a ray passes it."""
+    axis, away = shapes.end - shapes.start, origin[:, None] - shapes.start
+    dot = lambda a, b: np.einsum("...i,...i->...", a, b)  # noqa: E731
+    rays, r2 = ray[:, :, None], shapes.radius_m**2
+    n2, d2 = dot(axis, axis)[:, None], dot(ray, ray)[..., None]
+    along, from_axis = dot(rays, axis[:, None]), dot(away, axis)[:, None]
+    ahead, out2 = dot(rays, away[:, None]), dot(away, away)[:, None]
+
+    def nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """First root of a x^2 + 2 b x + c."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return (-b - np.sqrt(b**2 - a * c)) / a
+
+    wall = nearest(n2 * d2 - along**2, n2 * ahead - along * from_axis, n2 * (out2 - r2) - from_axis**2)
+    between = from_axis + wall * along
+    top = out2 - 2 * from_axis + n2
+    caps = [nearest(d2, ahead, out2 - r2), nearest(d2, ahead - along, top - r2)]
+    found = np.fmin(np.where((between >= 0) & (between <= n2), wall, np.nan), np.fmin(*caps))
+    # Where a ray enters one part within another, it entered that other part before.
+    return np.where(np.isfinite(found) & (found > 0), found, np.inf)
+
+
 def stature_m(body: Body, scale: np.ndarray) -> float:
     """Height (m) of the body with scale multipliers (8,), standing at `qpos = 0`: from its soles to the top of its
     head, as its shapes have them (1.80 m unscaled)."""

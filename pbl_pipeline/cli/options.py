@@ -38,6 +38,15 @@ IMU = click.option(
     metavar="[SEGMENT=]FILE",
     help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit.",
 )
+DEPTH = click.option(
+    "--depth",
+    multiple=True,
+    metavar="FILE_OR_FOLDER",
+    help="Depth recording of a video (docs/depth.md), once for each, in their order; 'none' for one without.",
+)
+DEPTH_SCALE = click.option(
+    "--depth-scale", type=float, help="Metres of one step of the 16-bit pictures of --depth, such as 0.001."
+)
 COMPARE = click.option(
     "--compare",
     "earlier",
@@ -70,6 +79,18 @@ def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     for log in logs:
         click.echo("; ".join((f"{log.segment}: sensor {log.name}, {log.time[-1] - log.time[0]:.0f} s", *log.notes)))
     return logs
+
+
+def depth_files(given: Sequence[str], n: int) -> list[Path | None]:
+    """Paths of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them."""
+    if given and len(given) != n:
+        raise PblError(
+            "USAGE",
+            found=f"{len(given)} times --depth for {n} videos",
+            expected="none, or one for each video, in the same order",
+            next_step="name a recording for each video, 'none' for one without",
+        )
+    return [None if path == "none" else Path(path) for path in given] or [None] * n
 
 
 def show_changes(visit: Visit, before: Visit, metrics: Path) -> None:

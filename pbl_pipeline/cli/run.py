@@ -12,6 +12,8 @@ from .options import (
     CAMERA_MOTION_HELP,
     CAMERA_MOTIONS,
     COMPARE,
+    DEPTH,
+    DEPTH_SCALE,
     DEVICE,
     HEIGHT,
     IMU,
@@ -20,6 +22,7 @@ from .options import (
     MASS,
     PEOPLE,
     Person,
+    depth_files,
     fit_paramset,
     keypoint_method,
     sensor_logs,
@@ -39,6 +42,8 @@ from .options import (
     help="Sensor log of the phone (docs/phone_capture.md), once for each VIDEO, in their order.",
 )
 @IMU
+@DEPTH
+@DEPTH_SCALE
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option(
     "--person",
@@ -65,6 +70,8 @@ def run(
     camera: Path | None,
     attitude: tuple[Path, ...],
     imu: tuple[str, ...],
+    depth: tuple[str, ...],
+    depth_scale: float | None,
     camera_motion: str | None,
     person: int | None,
     people: str | None,
@@ -113,7 +120,7 @@ def run(
 
     before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
-    sensors = sensor_logs(imu)
+    sensors, depths = sensor_logs(imu), depth_files(depth, len(videos))
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
@@ -131,6 +138,8 @@ def run(
         mass_kg,
         activity,
         sensors,
+        depths,
+        depth_scale,
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

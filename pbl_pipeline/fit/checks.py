@@ -14,6 +14,7 @@ from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
 from pbl_pipeline.results import SensorFit
 
 from .augmented_pelvis import folds
+from .depths import DepthFit
 from .initial_pose import pelvis_path
 from .results import SD_WARN_DEG, TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
@@ -35,6 +36,10 @@ CLOCK_WARN_S = 0.3
 #: least angular velocity (rad/s, root mean square) that shows how a sensor sits: people who walk have 1 and more.
 SENSOR_Z_WARN, SENSOR_DROPPED_WARN, SENSOR_SLIP_WARN = 1.7, 0.2, 2.5
 SENSOR_BIAS_WARN_DEG_S, SENSOR_RATE_WARN = 3.0, 0.3
+#: Of depths: error in standard deviations; least shares of the large joints with one, and of depths in sight that lie
+#: where the person is; distance of the fit without them over theirs, which a detector's guess of a person's size and a
+#: guessed focal length allow.
+DEPTH_Z_WARN, DEPTH_USED_WARN, DEPTH_FITS_WARN, DEPTH_LOW, DEPTH_HIGH = 2.5, 0.1, 0.8, 0.65, 1.4
 #: Standard deviation of the focal length as a share of it, which is also that of depth and of the person's size.
 FOCAL_SD_WARN = 0.02
 
@@ -73,6 +78,7 @@ def check_fit(
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
     checks += _sensors([sensor for trial in trials for sensor in trial.sensors])
+    checks += _depths(solution.depth)
     # Only a check that did not pass has advice.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
@@ -148,6 +154,45 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
             0.0,
             f"by its movement a video lies {off:.0f} s from where its time of recording is in the log of the sensors; "
             "set the clocks of phone and sensors, or name the log of this recording",
+        ),
+    ]
+
+
+def _depths(found: DepthFit | None) -> list[Check]:
+    """Checks of the depths; empty if there are none."""
+    if found is None:
+        return []
+    had = np.isfinite(found.z)
+    used, z = float(np.min(found.used[had])), float(np.max(found.z[had]))
+    fits, ratio = float(np.min(found.fits[had])), float(found.distance[had][0])
+    return [
+        Check(
+            "depth_distance_ratio",
+            PASS if DEPTH_LOW <= ratio <= DEPTH_HIGH else FAIL,
+            ratio,
+            DEPTH_HIGH if ratio > 1 else DEPTH_LOW,
+            "the depths make the person much larger or smaller than people are: their scale, their camera, or a child",
+        ),
+        warn_if(
+            not used >= DEPTH_USED_WARN,
+            "depth_share_used",
+            used,
+            DEPTH_USED_WARN,
+            "the depth camera saw few of the joints: film from 2 to 5 m, out of the sun",
+        ),
+        warn_if(
+            not fits >= DEPTH_FITS_WARN,
+            "depth_share_on_person",
+            fits,
+            DEPTH_FITS_WARN,
+            "many depths do not lie where the person is: another recording, or pictures that are turned or mirrored",
+        ),
+        warn_if(
+            not z <= DEPTH_Z_WARN,
+            "depth_misfit_sd",
+            z,
+            DEPTH_Z_WARN,
+            "the depths differ from the person's movement: another recording, pictures that are late, or loose clothes",
         ),
     ]
 

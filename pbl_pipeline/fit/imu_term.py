@@ -138,8 +138,8 @@ def _residual(at: At, z: Float[Array, "F m 17"]) -> Float[Array, "F m 3"]:
 
 def _prior(at: At) -> Array:
     worn, state, w = at.problem.wearables, at.state.wearing, at.weights
-    if worn is None or state is None:
-        return jnp.zeros(())
+    assert worn is not None
+    assert state is not None
     z2 = jnp.sum((state.mount / jnp.deg2rad(jnp.minimum(w["mount_sd_deg"], worn.mount_sd_deg))[:, None]) ** 2)
     z2 += jnp.sum((state.bias / worn.bias_sd_rad_s[:, None]) ** 2)
     z2 += jnp.sum((state.clock / jnp.stack([w["sensor_clock_sd_s"], w["sensor_gain_sd_s"]])) ** 2)
@@ -163,4 +163,4 @@ LIMU = Term(
     count=lambda at: jnp.zeros(0) if at.problem.wearables is None else at.problem.wearables.count,
     frames=lambda at: at.problem.weight * _worn(at).dispersion,
 )
-WEARING = SharedTerm("sensor prior", "weight_sensor", _prior)
+WEARING = SharedTerm("sensor prior", "weight_sensor", _prior, empty=lambda at: at.state.wearing is None)

@@ -45,9 +45,10 @@ def residual_2d_px(
 def residual_3d_cm(
     x: Float[Array, "*n J 3"], detected: Float[Array, "*n J 3"], depth_ratio: ArrayLike = 1.0
 ) -> Float[Array, "*n J 3"]:
-    """Model points minus detected ones. `depth_ratio`: weight of a distance along the last axis, a camera's, relative
-    to one across it (1: the paper's)."""
-    per_m = 100.0 * jnp.concatenate([jnp.ones(2), jnp.reshape(jnp.asarray(depth_ratio, x.dtype), 1)])
+    """Model points minus detected ones. `depth_ratio` (1 or *n J 1): weight of a distance along the last axis, a
+    camera's, relative to one across it (1: the paper's)."""
+    ratio = jnp.atleast_1d(jnp.asarray(depth_ratio, x.dtype))
+    per_m = 100.0 * jnp.concatenate([jnp.ones((*ratio.shape[:-1], 2)), ratio], axis=-1)
     return (x - detected) * per_m
 
 
@@ -90,7 +91,11 @@ def _residual_3d(at: At, x: Float[Array, "F J 3"]) -> Float[Array, "F V J 3"]:
     detected = corrected_points(p, at.state)
     centre = mean_weights(p.c_3d, p.weight_3d)
     away = offset_m(in_camera(at.x, at.state.R_nc, p.p_nc), detected, centre)
-    return residual_3d_cm(in_camera(x, at.state.R_nc, p.p_nc) - away, detected, at.weights["depth_ratio"])
+    ratio = at.weights["depth_ratio"]
+    if p.depths is not None:  # a measured depth errs less, and not for long
+        measured = at.weights["depth_ratio_measured"]
+        ratio = ratio * jnp.where(p.depths.count > 0, measured, 1.0)[:, None, :, None]
+    return residual_3d_cm(in_camera(x, at.state.R_nc, p.p_nc) - away, detected, ratio)
 
 
 def _residual_2d(at: At, x: Float[Array, "F J 3"]) -> Float[Array, "F V J 2"]:

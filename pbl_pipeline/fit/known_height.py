@@ -1,4 +1,4 @@
-"""Conversion of the metres of the fit to the person's: by the measured height, else by the detector's guess of size.
+"""Conversion of the metres of the fit to the person's: by depths, the measured height, or the detector's guess of size.
 
 One camera sees no lengths: a person half as large at half the distance has the same pixels, and the size of the
 detector's 3D points is a guess (those of `blazepose-heavy` were 6 % too small on six recordings,
@@ -21,14 +21,14 @@ from .solution import Solution
 
 def in_metres(session: Session, solution: Solution, height_m: float | None) -> tuple[Solution, float | None]:
     """The solution in metres of a body of the person's height, or in the detector's if that is not known; and the ratio
-    of that height to the detector's (None: unknown).
+    of that height to the fitted one (None: unknown).
 
-    Lengths that several cameras or laboratory markers measured do not change.
+    Lengths that several cameras, a depth camera or laboratory markers measured do not change.
     """
-    detectors = 1.0 / session.metre
-    taller = None if height_m is None else height_m / (detectors * stature_m(session.body, solution.scale))
-    factor = detectors
-    if taller is not None and all(isinstance(t, Keypoints) for t in session.trials):
+    factor = 1.0 / (session.metre if solution.depth is None else solution.depth.metre)
+    taller = None if height_m is None else height_m / (factor * stature_m(session.body, solution.scale))
+    guessed = solution.depth is None and all(isinstance(t, Keypoints) for t in session.trials)
+    if taller is not None and guessed:
         factor *= taller
     return solution if factor == 1.0 else _enlarged(session, solution, factor), taller
 

@@ -6,7 +6,8 @@ its derivative is that of a function of a few numbers times the kinematic Jacobi
 
 Unknowns of a frame: qpos (Q) and, where the camera moves, a small rotation of it (3, world axes, from the left).
 Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N), where the paramset asks for them
-the detector's errors common to all frames of a trial (lean 3, depth J; N times), and the unknowns of wearable sensors.
+the detector's errors common to all frames of a trial (lean 3, depth J; N times), and the unknowns of wearable sensors
+and of the surface that a depth camera sees.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from jaxtyping import Array, Float
 
 from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multipliers
 
+from .depth_term import LDEPTH, by_surface
 from .detector_error import DetectorError, detector_blocks, detector_error
 from .feet_terms import later
 from .imu_term import segments_at
@@ -39,7 +41,7 @@ from .term import At, Rows, SharedTerm, Term, Unknowns, frame_count
 from .weights import Weights
 
 #: Terms that are added by way of the markers' positions (`_marker_blocks`).
-OF_MARKERS = (Unknowns.MARKER, Unknowns.CENTRED_MARKER)
+OF_MARKERS = (Unknowns.MARKER, Unknowns.MARKER_AND_SURFACE, Unknowns.CENTRED_MARKER)
 OF_OTHERS = tuple(u for u in Unknowns if u not in OF_MARKERS)
 #: Frames whose markers are differentiated at once: bounds the memory of long sessions.
 CHUNK = 512
@@ -85,9 +87,11 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
         x, soles, costs, sum_ = _keypoint_terms(body, p, w, state, columns)
         markers, at_floor, _ = p.split(x)
         at = At(p, w, state, markers, at_floor, phone_at(p, state), segments_at(body, p, state))
-        values = [term.mean(at, cost) for term, cost in zip(_terms(at, *OF_MARKERS), costs, strict=True)]
-        seen = functools.reduce(jnp.add, values)
+        of_markers = list(_terms(at, *OF_MARKERS))
+        values = [term.mean(at, cost) for term, cost in zip(of_markers, costs, strict=True)]
+        seen = functools.reduce(jnp.add, [v for v, term in zip(values, of_markers, strict=True) if term is not LDEPTH])
         sum_, others = _add_shared(sum_, at, columns)
+        others = functools.reduce(jnp.add, [v for v, t in zip(values, of_markers, strict=True) if t is LDEPTH], others)
         for term in _terms(at, *OF_OTHERS):
             sum_, value = _add_term(sum_, term, at, soles, columns)
             others += value
@@ -120,6 +124,7 @@ class _Columns(NamedTuple):
     floor: slice
     detector: slice
     wearing: slice
+    surface: slice
     frame: int  # unknowns of a frame
     size: int
 
@@ -127,15 +132,15 @@ class _Columns(NamedTuple):
 def _columns_of(state: State, moving: bool) -> _Columns:
     sizes = [sum(a.size for a in jax.tree.leaves(part)) for part in _shared_parts(state, moving)]
     ends = np.cumsum(sizes).tolist()
-    s, offset, clock, floor, detector, wearing = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    return _Columns(s, offset, clock, floor, detector, wearing, state.qpos.shape[1] + 3 * moving, ends[-1])
+    places = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return _Columns(*places, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
 def _shared_parts(state: State, moving: bool) -> tuple[Any, ...]:
     """The shared unknowns of a state; clocks where a camera moves."""
     detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
     clock_s = state.clock_s if moving else state.clock_s[:0]
-    return state.s, state.site_offset_m, clock_s, state.floor, detector, state.wearing
+    return state.s, state.site_offset_m, clock_s, state.floor, detector, state.wearing, state.surface
 
 
 def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[Array], State]]:
@@ -143,7 +148,7 @@ def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[A
     y, parts_of = ravel_pytree(_shared_parts(state, moving))
 
     def with_shared(y: Float[Array, " K"]) -> State:
-        s, offset, clock, floor, detector, wearing = parts_of(y)
+        s, offset, clock, floor, detector, wearing, surface = parts_of(y)
         return dataclasses.replace(
             state,
             s=s,
@@ -153,6 +158,7 @@ def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[A
             lean=detector[:, :3],
             depth_m=detector[:, 3:],
             wearing=wearing,
+            surface=surface,
         )
 
     return y, with_shared
@@ -201,7 +207,7 @@ def _keypoint_terms(
         out, (C, h) = some(frames_at(p, index), state.qpos[index], state.R_nc[index])
         return (carry[0] + C, carry[1] + h), out
 
-    k = state.s.size + state.site_offset_m.size + state.lean.size + state.depth_m.size
+    k = sum(s.stop - s.start for s in _of_markers(columns))
     (C, h), out = jax.lax.scan(step, (jnp.zeros((k, k)), jnp.zeros(k)), jnp.arange(frames).reshape(-1, size))
     x, soles, costs, (H, g, B) = jax.tree.map(lambda a: a.reshape(frames, *a.shape[2:]), out)
     return x, soles, costs, _with_room(H, g, B, C, h, columns)
@@ -209,7 +215,7 @@ def _keypoint_terms(
 
 def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tuple[list[Array], tuple, tuple]:
     """Costs (F,) of each keypoint term, and blocks of all: H (F, U, U), g (F, U), B (F, U, K), and C (K, K), h (K,), of
-    s, offsets and the detector's errors."""
+    s, offsets, the detector's errors and the surface."""
     p, x, U = at.problem, jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
@@ -221,7 +227,7 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     linear = [(term, term.rows(at)) for term in _terms(at, *OF_MARKERS)]
     # Force on each marker, and its curvature (F, J, 3, 3): of terms as they are, and of centred ones in each view.
     f, M = jnp.zeros_like(x), jnp.zeros((*x.shape, 3), x.dtype)
-    for c, r, D, _ in (rows for t, rows in linear if t.unknowns is Unknowns.MARKER):
+    for c, r, D, _ in (rows for t, rows in linear if t.unknowns is not Unknowns.CENTRED_MARKER):
         f += jnp.einsum("fvm,fvmij,fvmi->fmj", c, D, r)
         M += jnp.einsum("fvm,fvmik,fvmil->fmkl", c, D, D)
     centred = mean_weights(p.c_3d, p.weight_3d)
@@ -269,6 +275,15 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
         B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, in_3d, G, f_3d, q)
         B, h = jnp.concatenate([B, B_d], axis=-1), jnp.concatenate([h, h_d])
         C = jnp.block([[C, C_d], [C_d.T, C_dd]])
+    for c, r, D, _ in (rows for t, rows in linear if t.unknowns is Unknowns.MARKER_AND_SURFACE):
+        cD, by = c[:, 0, :, None] * D[:, 0, :, 0], by_surface(at)
+        by_A = jnp.einsum("fmiq,fmi,fmy->fqy", A[..., :n], cD, by)
+        by_o = jnp.einsum("fmik,fmi,fmy->mky", U, cD, by).reshape(3 * markers, -1)
+        C_y = jnp.concatenate([jnp.sum(by_A[:, q:], axis=0), by_o])
+        C_y = jnp.pad(C_y, [(0, C.shape[0] - C_y.shape[0]), (0, 0)])
+        C = jnp.block([[C, C_y], [C_y.T, jnp.einsum("fm,fmx,fmy->xy", c[:, 0], by, by)]])
+        B = jnp.concatenate([B, by_A[:, :q]], axis=-1)
+        h = jnp.concatenate([h, jnp.einsum("fm,fm,fmy->y", c[:, 0], r[:, 0, :, 0], by)])
     return [rows.cost for _, rows in linear], (G[:, :q, :q], -pulled[:, :q], B), (C, -h)
 
 
@@ -277,9 +292,14 @@ def _terms(at: At, *unknowns: Unknowns) -> Iterator[Term]:
     return (t for t in TERMS if isinstance(t, Term) and t.unknowns in unknowns and not t.empty(at))
 
 
+def _of_markers(columns: _Columns) -> tuple[slice, ...]:
+    """The shared unknowns that the keypoints' terms depend on."""
+    return columns.s, columns.offset, columns.detector, columns.surface
+
+
 def _with_room(H: Array, g: Array, B: Array, C: Array, h: Array, columns: _Columns) -> _Blocks:
     """The keypoints' blocks with room for all shared unknowns and no links yet."""
-    among_all = functools.partial(_spread, at=(columns.s, columns.offset, columns.detector), size=columns.size)
+    among_all = functools.partial(_spread, at=_of_markers(columns), size=columns.size)
     none = jnp.zeros_like(g)
     of_shared = among_all(B), among_all(among_all(C).T).T, among_all(h)
     return _Blocks(H, g, jnp.zeros_like(H), none, none, none, *of_shared)
@@ -405,10 +425,11 @@ def _add_bands(sum_: _Blocks, rows: Rows) -> _Blocks:
 def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> tuple[_Blocks, Array]:
     """The sum with the terms of the shared unknowns alone, all quadratic, and their value."""
     y, with_shared = _shared(at.state, at.problem.moving)
+    terms = [term for term in TERMS if isinstance(term, SharedTerm) and not term.empty(at)]
 
     def cost(y: Array) -> Array:
         there = at._replace(state=with_shared(y))
-        return functools.reduce(jnp.add, [term.value(there) for term in TERMS if isinstance(term, SharedTerm)])
+        return functools.reduce(jnp.add, [term.value(there) for term in terms])
 
     n = frame_count(at.problem)
     slope, push = jax.linearize(jax.grad(cost), y)

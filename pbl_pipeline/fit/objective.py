@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .depth_term import LDEPTH, SURFACE
 from .feet_terms import LFLOOR, LSLIDE
 from .imu_term import LIMU, WEARING
 from .joint_terms import LIMITS, LPELVIS, POSE_PRIOR, SMOOTHNESS
@@ -23,8 +24,8 @@ PAPER = (L3D, L_MARKERS, L2D, LPHONE, LOFFSET)
 OF_SINGLE_FRAMES: tuple[AnyTerm, ...] = (*PAPER, POSE_PRIOR, SCALE)
 #: All of them.
 TERMS: tuple[AnyTerm, ...] = (
-    *(*PAPER, POSE_PRIOR, LIMITS, SMOOTHNESS, LFLOOR, LSLIDE, LPELVIS, LIMU, DETECTOR),
-    *(SCALE, SIZE, CLOCK, FLOOR, WEARING),
+    *(*PAPER, POSE_PRIOR, LIMITS, SMOOTHNESS, LFLOOR, LSLIDE, LPELVIS, LIMU, LDEPTH, DETECTOR),
+    *(SCALE, SIZE, CLOCK, FLOOR, WEARING, SURFACE),
 )
 
 

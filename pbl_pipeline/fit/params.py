@@ -158,6 +158,12 @@ class GaussNewtonParams:
     mount_sd_deg: float = later(20.0)
     sensor_clock_sd_s: float = later(0.2)
     sensor_gain_sd_s: float = later(0.006)
+    #: Depths (`depth_term.py`): half squares in standard deviations, in the same way; that of a depth (m).
+    weight_depth: float = later(1.0)
+    huber_depth: float = later(2.0)
+    depth_point_sd_m: float = later(0.02)
+    #: Share of `depth_ratio` at points whose depth was measured: a detector's own errs for long times.
+    depth_ratio_measured: float = later(0.3)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
     #: Least standard deviation in deg (slides: cm), added in squares: detector errors that are common to many frames,
     #: which averaging does not reduce.

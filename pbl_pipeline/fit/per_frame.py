@@ -25,6 +25,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.jax_setup import compile_seconds
 from pbl_pipeline.sampling import interval_of
 
+from . import depths
 from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
@@ -56,9 +57,10 @@ def solve_per_frame(
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
-    floor, the augmenter's pelvis or measured weights, or sensors are worn, a first solution shows when each foot
-    stands, what the augmenter sees, how far each point errs and how the sensors sit, and a second one uses it. Where
-    the augmenter is needed and not available, its error takes the place of the solution.
+    floor, the augmenter's pelvis or measured weights, or there are sensors or depths, a first solution shows when each
+    foot stands, what the augmenter sees, how far each point errs, how the sensors sit and which depths are the
+    person's, and a second one uses it. Where the augmenter is needed and not available, its error takes the place of
+    the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
@@ -67,7 +69,7 @@ def solve_per_frame(
     if first is None:
         return
     body, w = first[0].body, Weights.of(first[0].body, params, size_unseen=pixels_alone(first[0].problem))
-    fit = fit_many if several and first[0].worn is None else _one_by_one
+    fit = fit_many if several and first[0].plain else _one_by_one
     begun, done = dict[Task, tuple[int, _Steps]](), dict[int, Solution | PblError]()
     waiting, numbers, due = deque[Task](), itertools.count(), 0
 
@@ -123,13 +125,13 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
     one_camera = session.problem.c_2d.shape[1] == 1  # of several, residuals are also of their calibration
     measured = one_camera and (params.points_px > 0 or params.points_cm > 0)
     refined = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
-    twice = measured or refined or session.worn is not None
+    twice = measured or refined or not session.plain
     p = session.problem
     found = yield Task(p, _with_detector(start, params), last=not twice)
     if suspicious(session, found.end.state.qpos):
         turned = yield Task(p, _with_detector(start_of(session, flip=True), params), last=not twice)
         found = min(found, turned, key=lambda f: float(f.end.cost))
-    trace, told, moves_with = found.trace, None, ()
+    trace, told, moves_with, in_place = found.trace, None, (), np.zeros(0)
     if twice:
         p, start = _on_floor(session, found)
         if measured:
@@ -139,14 +141,21 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
             told = np.asarray(p.c_pelvis)
         if session.worn is not None:
             p, start, moves_with = with_wearables(session, p, start, float(found.dispersion))
+        if session.depths:
+            assert found.x is not None
+            p, start, in_place = depths.with_depths(session, p, start, p.split(found.x)[0], float(found.dispersion))
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
     solution = _solution(session, p, params, found, trace, told)
-    if session.worn is None:
-        return solution
-    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
-    return dataclasses.replace(solution, sensors=sensors)
+    if session.worn is not None:
+        sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
+        solution = dataclasses.replace(solution, sensors=sensors)
+    if session.depths:
+        x = solution.outcome.x_world_m
+        depth = depths.depth_fit(session, p, start, found.end.state, x, in_place, params.depth_point_sd_m)
+        solution = dataclasses.replace(solution, depth=depth)
+    return solution
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -239,6 +248,8 @@ def _solution(
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
     if session.worn is not None:
         floor = floor * shares_of_floors(session, p)
+    if session.depths:
+        floor = floor * depths.shares_of_floors(session, p)
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)

@@ -95,6 +95,32 @@ class Wearing:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Depths:
+    """Depths at the markers as a depth camera measured them, along the axis of the camera of the video.
+
+    `depth_m`: of the surface there, and `count`: 1 where it counts; `skin_m`: the surface's depth less the marker's, by
+    the body's shapes; `offset_sd_m`: of its error on each marker; `dispersion`: of the keypoints (`Linearised`).
+    """
+
+    depth_m: Float[Array, "F J"]
+    count: Float[Array, "F J"]
+    skin_m: Float[Array, "F J"]
+    offset_sd_m: Float[Array, " J"]
+    dispersion: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """Unknowns of a session with depths: `offset_m`, how much further away the surface is at each marker than the
+    body's shapes say; `metre`, metres of the fit in one of the depths."""
+
+    offset_m: Float[Array, " J"]
+    metre: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class Problem:
     """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J
     where markers were measured in the world, which have no views, and 0 otherwise.
@@ -139,6 +165,7 @@ class Problem:
     sample_start_s: Float[Array, " N"]
     sample_step_s: Float[Array, ""]
     wearables: Wearables | None = None
+    depths: Depths | None = None
 
     @property
     def moving(self) -> bool:
@@ -175,6 +202,7 @@ class State:
     lean: Float[Array, "D 3"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 3)))
     depth_m: Float[Array, "D J"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 0)))
     wearing: Wearing | None = None
+    surface: Surface | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -358,12 +386,16 @@ PER_FRAME = (
     *("weight", "trial", "x_cam", "c_3d", "xy_px", "c_2d", "x_world", "c_world", "R_nc", "p_nc"),
     *("camera_matrix", "pixel_px"),
 )
+DEPTHS_PER_FRAME = ("depth_m", "count", "skin_m")
 
 
 def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:
     """The keypoints and cameras of some frames, by their numbers; other fields are left as they are."""
     take = lambda a: a.at[index].get(mode="promise_in_bounds")  # noqa: E731
-    return dataclasses.replace(p, **{k: take(getattr(p, k)) for k in PER_FRAME})
+    rows = {k: take(getattr(p, k)) for k in PER_FRAME}
+    if p.depths is not None:
+        rows["depths"] = dataclasses.replace(p.depths, **{k: take(getattr(p.depths, k)) for k in DEPTHS_PER_FRAME})
+    return dataclasses.replace(p, **rows)
 
 
 def pixels_alone(problem: Problem) -> bool:

@@ -18,6 +18,8 @@ from pbl_pipeline.records import from_json, plain, record
 from pbl_pipeline.results import SensorFit, Solution
 from pbl_pipeline.video import Camera, check_lens
 
+from .depths import DepthFit
+
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
 SD_WARN_DEG = 20.0
 
@@ -36,7 +38,7 @@ class TrialFit:
     estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
     the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
     keypoints, which tells their detector, "" if they have none or the file is from before it was kept. sensors: what
-    was found of each wearable sensor.
+    was found of each wearable sensor. with_depths: depth recordings set the scale.
     """
 
     name: str
@@ -66,6 +68,12 @@ class TrialFit:
     height_m: float = float("nan")
     confidence_curve: str = ""
     sensors: tuple[SensorFit, ...] = ()
+    with_depths: bool = False
+
+    @property
+    def sized(self) -> bool:
+        """True if the person's stated height or depth recordings set the scale of one camera."""
+        return bool(np.isfinite(self.height_m)) or self.with_depths
 
     @functools.cached_property
     def not_observed(self) -> frozenset[str]:
@@ -98,6 +106,7 @@ class TrialFit:
         data = {
             "height_m": np.asarray(np.nan),
             "confidence_curve": np.asarray(""),
+            "with_depths": np.asarray(False),
             "sensors": np.asarray("[]"),
             **load_npz(path, [*fields, "sensors"]),
         }
@@ -124,6 +133,7 @@ class TrialFit:
         values["confidence_curve"] = text_of(path, data, "confidence_curve")
         for k in ("loss", "seconds", "phone_clock_offset_s", "height_m"):
             values[k] = float(values[k])
+        values["with_depths"] = bool(values["with_depths"])
         camera = Camera(data["camera_matrix"], data["distortion"], text_of(path, data, "camera_source"))
         values["image_size_px"] = (0, 0)
         if not np.isnan(camera.matrix).all():  # as of markers of a laboratory
@@ -139,6 +149,7 @@ class SessionFit(Solution):
     trials: tuple[TrialFit, ...]
     site_offset_m: np.ndarray
     qc: tuple[Check, ...]
+    depth: DepthFit | None = None
 
 
 #: Fields of a trial that its file has as they are.
@@ -151,4 +162,11 @@ def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
     shapes |= dict.fromkeys(("residual_2d_px", "residual_3d_m"), (n, j))
     shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
     shapes |= {"scale": (len(SCALE_NAMES),), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
-    return shapes | {"loss": (), "seconds": (), "height_m": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
+    return shapes | {
+        "with_depths": (),
+        "loss": (),
+        "seconds": (),
+        "height_m": (),
+        "camera_position_m": (3,),
+        "phone_clock_offset_s": (),
+    }

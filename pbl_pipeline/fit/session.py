@@ -61,6 +61,12 @@ class Session:
     metre: float = 1.0
     turned: tuple[Turned, ...] = ()  # trials whose vertical was wrong (`world_checks`)
     worn: Worn | None = None
+    depths: tuple[np.ndarray | None, ...] = ()  # of each trial (T, J, 2), `at_points`; empty without any
+
+    @property
+    def plain(self) -> bool:
+        """True if keypoints and the phone's orientation are all that was measured."""
+        return self.worn is None and not self.depths
 
     def frames(self, i: int) -> slice:
         """Position of trial `i` in the packed frames."""

@@ -22,6 +22,7 @@ from pbl_pipeline.sensors.worn import worn
 from pbl_pipeline.video import Camera
 
 from .checks import check_fit
+from .depths import check_depths
 from .known_height import in_metres
 from .lever_arms import with_marker_places
 from .many_sessions import Packed, Work
@@ -52,6 +53,7 @@ class SessionInput:
     height_m: float | None = None
     sensors: Sequence[SensorLog] = ()
     sensor_clock_s: Sequence[Stated] | None = None
+    depths: Sequence[np.ndarray | None] = ()
 
 
 def fit_session(
@@ -63,10 +65,12 @@ def fit_session(
     height_m: float | None = None,
     sensors: Sequence[SensorLog] = (),
     sensor_clock_s: Sequence[Stated] | None = None,
+    depths: Sequence[np.ndarray | None] = (),
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
-    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, DEPTH_FILE, SOLVER_UNKNOWN,
+    FIT_DIVERGED.
 
     Parameters
     ----------
@@ -92,8 +96,10 @@ def fit_session(
         Time of the logs at time 0 of each trial's video, to half a second, or the earliest and latest one by wall
         clocks (`sensors.places`); None where it is not known, so that it is looked for in the whole log. Default: one
         trial, in which both begin together; not known of several.
+    depths
+        Of each trial of one camera, (T, J, 2) in m at its keypoints (`depth.at_points`), or None.
     """
-    given = SessionInput(trials, names, camera_motion, markers, height_m, sensors, sensor_clock_s)
+    given = SessionInput(trials, names, camera_motion, markers, height_m, sensors, sensor_clock_s, depths)
     result = fit_sessions([given], paramset)[0]
     if isinstance(result, PblError):
         raise result
@@ -121,11 +127,13 @@ def fit_sessions(
         check_height(given.height_m)
         session = make_session(given.trials, given.names, method.params, _motions(given), given.markers)
         sensors = worn(given.sensors, given.sensor_clock_s, len(given.trials))
-        if sensors is not None and not isinstance(method.params, GaussNewtonParams):
-            raise input_error(f"wearable sensors and the method {method.key}", "a method of the solver gauss-newton")
-        session = dataclasses.replace(session, worn=sensors)
+        session = dataclasses.replace(session, worn=sensors, depths=check_depths(given.depths, session.trials))
+        if not session.plain and not isinstance(method.params, GaussNewtonParams):
+            raise input_error(
+                f"wearable sensors or depths and the method {method.key}", "a method of the solver gauss-newton"
+            )
         shapes = tuple(a.shape for a in jax.tree.leaves(session.problem))
-        kind = shapes, pixels_alone(session.problem), type(session.trials[0]), sensors is None
+        kind = shapes, pixels_alone(session.problem), type(session.trials[0]), session.plain
         return Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
 
     def finish(packed: Packed, solution: Solution) -> SessionFit:
@@ -187,6 +195,7 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution, taller),
+        depth=solution.depth,
     )
 
 
@@ -237,6 +246,7 @@ def _trial_fit(
         height_m=float("nan") if height_m is None else height_m,
         confidence_curve=view.confidence_curve if isinstance(view, Keypoints) else "",
         sensors=solution.sensors[i] if solution.sensors else (),
+        with_depths=solution.depth is not None,
     )
 
 

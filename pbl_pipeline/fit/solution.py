@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from pbl_pipeline.results import SensorFit
 
+from .depths import DepthFit
 from .keypoint_terms import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm
 from .problem import Problem
 from .solvers.result import Result
@@ -41,7 +42,7 @@ class Solution:
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
     deviations, None if the solver computes none; pelvis_told: 1 in frames with the augmenter's tilt of the pelvis, None
     if the method does not use it; metre: metres of the solution in one of the fit; sensors: what was found of those
-    worn, in each trial; result: reason why the solver ended.
+    worn, in each trial, and depth of the depths; result: reason why the solver ended.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -60,6 +61,7 @@ class Solution:
     pelvis_told: Float[np.ndarray, " F"] | None = None
     metre: float = 1.0
     sensors: tuple[tuple[SensorFit, ...], ...] = ()
+    depth: DepthFit | None = None
 
     @property
     def converged(self) -> bool:

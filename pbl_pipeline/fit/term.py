@@ -27,6 +27,7 @@ class Unknowns(enum.Enum):
 
     MARKER = "joints, camera, scale, marker offsets"
     CENTRED_MARKER = "joints, camera, scale, marker offsets, detector's lean and depths"
+    MARKER_AND_SURFACE = "joints, camera, scale, marker offsets, surface"
     PHONE = "camera, clock"
     JOINT = "a joint"
     JOINTS = "joints of a frame"
@@ -175,9 +176,11 @@ class SharedTerm:
     weight: str
     cost: Callable[[At], Array]
     unknowns: Unknowns = Unknowns.SHARED
+    #: True if a problem has no such unknowns, so that the term is left out.
+    empty: Callable[[At], bool] = lambda at: False
 
     def value(self, at: At) -> Float[Array, ""]:
-        return weight_of(self, at) * self.cost(at)
+        return jnp.zeros(()) if self.empty(at) else weight_of(self, at) * self.cost(at)
 
 
 def weight_of(term: Term | SharedTerm, at: At) -> Array | float:

@@ -50,7 +50,7 @@ FLOOR_SHARES = {
     "hip_flexion": (("pelvis", "thigh"), (1.0, 0.8, 0.7)),
     "hip_adduction": (("pelvis", "thigh"), (1.0, 0.67, 0.62)),
     "hip_rotation": (("pelvis", "thigh"), (1.0, 0.75, 0.7)),
-    "knee_": (("thigh", "shank"), (1.0, 0.75, 0.5)),
+    "knee_": (("thigh", "shank"), (1.0, 0.75, 0.53)),
     "ankle_": (("shank", "foot"), (1.0, 0.78, 0.7)),
 }
 
@@ -230,7 +230,7 @@ def _errors(body: Body, p: Problem, end: State) -> tuple[Array, Array]:
 def sensor_fits(
     session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
 ) -> tuple[tuple[SensorFit, ...], ...]:
-    """What a solution says of the sensors in each trial."""
+    """Results of a solution for the sensors in each trial."""
     worn, state, given = p.wearables, jax.tree.map(np.asarray, end.wearing), session.worn
     assert worn is not None
     assert given is not None

@@ -184,7 +184,7 @@ def find_cycles(
         poses = poses or trial_poses(fit)
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
-        stated = bool(np.isfinite(fit.height_m))
+        stated = fit.sized
         errors = "" if metric else model_of_fit(fit.params_hash, fit.confidence_curve)
     cycles, slides = [], []
     for bout in sorted({e.bout for e in found}):

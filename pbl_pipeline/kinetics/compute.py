@@ -337,7 +337,7 @@ def _checks(
         return ()
     residual = _residual(trials) or 0.0
     unexplained = "much of the force that the motion needs is carried by no foot: look at the events and at the fit"
-    sized = all(is_metric(f) or np.isfinite(f.height_m) for f in fits)
+    sized = all(is_metric(f) or f.sized for f in fits)
     assumed = "accelerations are scaled by an assumed body size: state the measured height"
     return in_order(
         (

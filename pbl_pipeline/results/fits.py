@@ -55,7 +55,7 @@ class Residuals:
 
 @record
 class SensorFit:
-    """What a fit found of a sensor in one of its trials; NaN where it was not measured or not stated."""
+    """Results of a fit for a sensor in one trial; NaN where it was not measured or not stated."""
 
     segment: str = column("sensor_segment", "segment of the body, such as shank_r", "varchar(8)", key=True)
     name: str = column("sensor_name", "its name in the log", "varchar(255)")

@@ -128,7 +128,7 @@ def test_no_link_of_a_page_is_dead(page: str):
 def test_the_page_of_licences_names_every_direct_dependency():
     project = tomllib.loads(pages.text("pyproject.toml"))["project"]
     extras = project["optional-dependencies"]
-    brought = [extras[name] for name in ("s3", "export", "figures", "h5")]
+    brought = [extras[name] for name in ("s3", "export", "figures", "h5", "depth")]
     wanted = {Requirement(r).name for r in itertools.chain(project["dependencies"], *brought)}
     table = pages.text("docs/licences.md").partition("## Direct dependencies")[2]
     _, *rows = re.findall(r"^\| [^|]* \| (.*) \|$", table, re.MULTILINE)

@@ -45,7 +45,7 @@ def read() -> dict[str, set[str]]:
     """Term -> parameters that its value reads, where the problem has something for it."""
     params = dataclasses.replace(PARAMS, weight_pelvis=0.5)
     found: dict[str, set[str]] = {}
-    for kind in ("moving floor pelvis detector sensors", "world"):
+    for kind in ("moving floor pelvis detector sensors depths", "world"):
         session = small_session(kind)
         w, state = Weights.of(session.body, params), away(session, detector="detector" in kind)
         noted = {term.name: Noted(w.numbers) for term in TERMS}

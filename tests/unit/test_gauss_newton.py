@@ -20,9 +20,10 @@ from pbl_pipeline.body import (
     mjx_frames,
     scale_multipliers,
 )
-from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
+from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams, normal_equations
+from pbl_pipeline.fit.depth_term import LDEPTH, SURFACE
 from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide_cm, slide_contact
-from pbl_pipeline.fit.imu_term import segments_at
+from pbl_pipeline.fit.imu_term import LIMU, WEARING, segments_at
 from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
@@ -35,7 +36,18 @@ from pbl_pipeline.fit.normal_equations import linearise, moved
 from pbl_pipeline.fit.objective import TERMS, total
 from pbl_pipeline.fit.per_frame import limits_of, standing, start_of
 from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual_phone_deg
-from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, Wearables, Wearing, bend_weights, pack, point_table
+from pbl_pipeline.fit.problem import (
+    SAMPLE_S,
+    Depths,
+    State,
+    Surface,
+    TrialArrays,
+    Wearables,
+    Wearing,
+    bend_weights,
+    pack,
+    point_table,
+)
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
 from pbl_pipeline.fit.solvers.gauss_newton import LevenbergMarquardt, Limits
@@ -273,7 +285,24 @@ def small_session(kind: str) -> Session:
         session = dataclasses.replace(
             session, problem=dataclasses.replace(session.problem, wearables=wearables(session))
         )
+    if "depths" in kind:
+        session = dataclasses.replace(session, problem=dataclasses.replace(session.problem, depths=depths(session)))
     return session
+
+
+def depths(session: Session) -> Depths:
+    """Depths of anything at some markers, some of them far off."""
+    rng, p = np.random.default_rng(13), session.problem
+    shape = len(p.weight), len(p.weight_3d)
+    count = (rng.random(shape) < 0.3) * p.weight[:, None]
+    values = {
+        "depth_m": rng.normal(4, 0.1, shape),
+        "count": count,
+        "skin_m": rng.normal(-0.05, 0.02, shape),
+        "offset_sd_m": np.full(shape[1], 0.02),
+        "dispersion": 0.3,
+    }
+    return Depths(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 
 
 def wearables(session: Session) -> Wearables:
@@ -291,6 +320,7 @@ def wearables(session: Session) -> Wearables:
         "follows": 0.8 * count * np.roll(count, -1, axis=0) * (np.diff(p.trial, append=-1) == 0)[:, None],
         "mount": quats(2),
         "world": quats(trials, 2),
+        "mount_sd_deg": [20.0, 3.0],
         "sd_rad": [0.3, 0.5],
         "bias_sd_rad_s": [0.02, 0.05],
         "level_sd_rad": np.full((trials, 2), 0.1),
@@ -320,6 +350,9 @@ def away(session: Session, seed: int = 3, detector: bool = False) -> State:
         lean=noise(np.zeros((d, 3)), 0.1),
         depth_m=noise(np.zeros((d, markers)), 0.05),
         wearing=None if session.problem.wearables is None else wearing(session, rng),
+        surface=None
+        if session.problem.depths is None
+        else Surface(noise(np.zeros(markers), 0.02), jnp.asarray(1.03, jnp.float32)),
     )
 
 
@@ -338,7 +371,17 @@ def at_state(session: Session, w: Weights, state: State) -> At:
 
 
 @pytest.mark.parametrize(
-    "kind", ["views", "world", "floor pelvis", "moving floor", "moving detector", "moving sensors", "detector sensors"]
+    "kind",
+    [
+        "views",
+        "world",
+        "floor pelvis",
+        "moving floor",
+        "moving detector",
+        "moving sensors",
+        "detector sensors depths",
+        "moving depths",
+    ],
 )
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
@@ -369,6 +412,10 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
         pairs |= {"turn": (at.g[:, 40:], want_g[:, 40:]), "clock": (at.h[k : k + 2], want_h[k : k + 2])}
         k += 2
     pairs["floor"] = (at.h[k : k + 6], want_h[k : k + 6])
+    if state.surface is not None:
+        end = -state.surface.offset_m.size - 1
+        pairs |= {"skin": (at.h[end:-1], want_h[end:-1]), "metre": (at.h[-1:], want_h[-1:])}
+        at, want_h = dataclasses.replace(at, h=at.h[:end]), want_h[:end]
     if state.wearing is not None:
         end = -sum(a.size for a in jax.tree.leaves(state.wearing))
         pairs |= {
@@ -385,6 +432,22 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     corner, diagonal = np.asarray(at.system.corner, np.float64), at.system.diagonal
     assert np.all(np.linalg.eigvalsh(corner) > -1e-3 * np.abs(corner).max())
     np.testing.assert_allclose(diagonal, np.swapaxes(diagonal, 1, 2), atol=1e-3 * np.abs(at.g).max())
+
+
+@pytest.mark.parametrize("kind", ["floor detector", "moving"])
+def test_a_fit_without_sensors_and_depths_is_the_same_program_as_without_their_terms(kind, monkeypatch):
+    """Equal programs have equal results, to the last bit."""
+    session = small_session(kind)
+    p, state = session.problem, away(session, detector="detector" in kind)
+    w = Weights.of(session.body, PARAMS)
+
+    def program() -> str:
+        return jax.jit(lambda p, s: linearise(session.body, p, w, s)).lower(p, state).as_text()
+
+    whole, known = program(), {LIMU, WEARING, LDEPTH, SURFACE}
+    assert known < set(normal_equations.TERMS)
+    monkeypatch.setattr(normal_equations, "TERMS", tuple(t for t in normal_equations.TERMS if t not in known))
+    assert program() == whole
 
 
 def test_curvature_of_the_detectors_depths_is_the_change_of_the_gradient():

@@ -80,7 +80,11 @@ _METHODS = ("tracking", "keypoint", "fit", "gdi", "norm", "kinetics")
     help="Sensor log of the phone (docs/phone_capture.md), once for each video, in their order; 'none' for no log.",
 )
 @click.option(
-    "--depth", type=click.Path(path_type=Path), multiple=True, metavar="FILE", help="Depth video, once for each video."
+    "--depth",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE",
+    help="Depth recording, once for each video; it is kept, not read.",
 )
 @click.option(
     "--imu",

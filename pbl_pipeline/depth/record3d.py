@@ -1,0 +1,58 @@
+"""Recordings of the app Record3D (`.r3d`): a zip of pictures, depths (LZFSE, float32 metres) and confidences (LZFSE,
+bytes 0 to 2). `metadata` is JSON: `dw`, `dh` and `w`, `h` (px) of the depth and colour pictures, `K` by columns of the
+colour picture, `fps`, and `frameTimestamps` (s) of newer versions.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pbl_pipeline import bounded
+from pbl_pipeline.extras import needed
+
+from .recording import Depth, Pictures, depth_error
+
+#: Bytes of a packed frame and of the metadata.
+_MOST = bounded.MIB
+
+
+def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
+    """Read a recording beside a video with pictures of this width and height. Raises `PblError` DEPTH_FILE;
+    PACKAGE_MISSING without the extra `depth`."""
+    lzfse = needed("lzfse", "the depths of Record3D")
+
+    def read(frames: Iterable[int]) -> Iterator[Pictures]:
+        with bounded.opened_zip(path) as archive:
+            names = set(archive.namelist())
+            for i in frames:
+                confidence = members[i].removesuffix("depth") + "conf"
+                depth = picture(archive, members[i], "<f4")
+                yield depth, picture(archive, confidence, np.uint8) if confidence in names else None
+
+    def picture(archive: zipfile.ZipFile, name: str, kind: str | type) -> np.ndarray:
+        try:
+            packed = bounded.read_member(archive, archive.getinfo(name), _MOST)
+            return np.frombuffer(lzfse.decompress(bytes(packed)), kind).reshape(height, width)
+        except (ValueError, lzfse.error, *bounded.DAMAGED) as error:
+            raise depth_error(f"{name}: {error}", f"{width}x{height} values", key=path) from error
+
+    try:
+        with bounded.opened_zip(path) as archive:
+            about = bounded.parse_json(bounded.read_member(archive, archive.getinfo("metadata"), _MOST).decode())
+            numbers = {int(m[1]): n for n in archive.namelist() if (m := re.fullmatch(r"rgbd/(\d{1,9})\.depth", n))}
+        width, height = int(about["dw"]), int(about["dh"])
+        matrix = np.array(about["K"], float).reshape(3, 3).T
+        matrix[:2] *= [[size_px[0] / about["w"]], [size_px[1] / about["h"]]]
+        stamps = about.get("frameTimestamps") or np.arange(len(numbers)) / float(about["fps"])
+        members = [numbers[i] for i in sorted(numbers)]
+        time = np.array(stamps, float)[: len(members)]
+        if not members or time.ndim != 1 or len(time) < len(members):
+            raise ValueError(f"{len(members)} depths and {np.shape(stamps)} times")
+    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, *bounded.DAMAGED) as error:
+        raise depth_error(f"no recording of Record3D ({error})", "the .r3d that the app exports", key=path) from error
+    return Depth(path, time - time[0], size_px, matrix, None, read)
