@@ -50,8 +50,8 @@ FLOOR_SHARES = {
     "hip_flexion": (("pelvis", "thigh"), (1.0, 0.8, 0.7)),
     "hip_adduction": (("pelvis", "thigh"), (1.0, 0.67, 0.62)),
     "hip_rotation": (("pelvis", "thigh"), (1.0, 0.75, 0.7)),
-    "knee_": (("thigh", "shank"), (1.0, 0.75, 0.53)),
-    "ankle_": (("shank", "foot"), (1.0, 0.78, 0.7)),
+    "knee_": (("thigh", "shank"), (1.0, 0.8, 0.61)),
+    "ankle_": (("shank", "foot"), (1.0, 0.9, 0.75)),
 }
 
 
