@@ -17,6 +17,7 @@ from pbl_pipeline.video import release_frames
 from pbl_schemas import tables_version
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.visit_progress import Scope
+from pbl_schemas.rows import exist
 
 from . import queue, refresh, registry, run_job
 from .heartbeat import Silent
@@ -267,15 +268,14 @@ class Worker:
         if self.only is not None:
             scope = self.only()
             # Asked first: what a job makes computable that ends after this is found in the next round.
-            wheres = {t: f"status='reserved' AND {w}" for t in self.tables if (w := scope.where(t)) is not None}
-            held = queue.having(wheres)
+            held = exist(*(jobs_of(t).reserved & w for t in self.tables if (w := scope.where(t)) is not None))
             found = refresh.refresh_scope(self.only())
             self.found.add(found)
             if found.queued or found.freed:
                 return True
             # Another worker may have queued a job since our last step and not taken it yet.
             ours = {} if self.limit is not None else self._conditions()
-            return None if held or queue.most_urgent(ours) else False
+            return None if any(held) or queue.most_urgent(ours) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
         self.heartbeat.doing("looks at all tables")

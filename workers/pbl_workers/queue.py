@@ -17,16 +17,15 @@ import os
 import platform
 import random
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
-
-from pymysql.converters import escape_string
 
 from pbl_pipeline.errors import PblError
 from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
-from pbl_schemas.rows import parts
+from pbl_schemas.rows import exist, parts
 from pbl_schemas.transactions import READ_COMMITTED, repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
@@ -121,7 +120,7 @@ def _committed(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
     connection.query(READ_COMMITTED)
-    return statement()  # a transaction of its own
+    return statement()  # alone it is that transaction
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
@@ -132,23 +131,6 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
             gone = jobs.restrict(needless, semantic_check=False)
             n += int(_committed(table.connection, functools.partial(gone.delete_quick, get_count=True)))
     return n
-
-
-def having(wheres: Mapping[Any, str]) -> list[Any]:
-    """Return the tables (classes) with a job that agrees with the condition given for them, by one statement."""
-    queues = (f"{jobs_of(table).full_table_name} WHERE {where}" for table, where in wheres.items())
-    there = "SELECT {} AS place FROM DUAL WHERE EXISTS (SELECT 1 FROM {})".format
-    return list(_united(wheres, [there(place, one) for place, one in enumerate(queues)]))
-
-
-def _united(tables: Iterable[Any], selects: Sequence[str]) -> dict[Any, list[dict[str, Any]]]:
-    """Return the rows of several selections by table, by one statement. `place`, their first column, counts tables."""
-    rows: dict[Any, list[dict[str, Any]]] = {}
-    tables = list(tables)
-    if tables:
-        for row in tables[0].connection.query(" UNION ALL ".join(selects), as_dict=True).fetchall():
-            rows.setdefault(tables[row["place"]], []).append(row)
-    return rows
 
 
 # --------------------------------------------------------------------------------------------------- reserving, ending
@@ -165,9 +147,9 @@ def most_urgent(wheres: Mapping[Any, str | None]) -> dict[Any, int]:
 def _ready(wheres: Mapping[Any, str | None], n: int) -> dict[Any, list[dict[str, Any]]]:
     """Return candidates for n jobs of each table that has some, the most urgent and oldest. Plain SQL: half of
     DataJoint's time for a query."""
-    queues = [jobs_of(table) for table in wheres]
+    tables, queues = list(wheres), [jobs_of(table) for table in wheres]
     keys = [jobs.primary_key for jobs in queues]
-    names, selects = dict.fromkeys(name for key in keys for name in key), []
+    names, selects, rows = dict.fromkeys(name for key in keys for name in key), [], defaultdict(list)
     for place, (jobs, key, where) in enumerate(zip(queues, keys, wheres.values(), strict=True)):
         columns = ", ".join(name if name in key else f"NULL AS {name}" for name in names)
         selects.append(
@@ -175,7 +157,9 @@ def _ready(wheres: Mapping[Any, str | None], n: int) -> dict[Any, list[dict[str,
             f" WHERE status='pending'{f' AND {where}' if where else ''} AND scheduled_time <= CURRENT_TIMESTAMP(3)"
             f" ORDER BY priority, scheduled_time LIMIT {_SPREAD * n})"
         )
-    return _united(wheres, selects)
+    for row in queues[0].connection.query(" UNION ALL ".join(selects), as_dict=True) if queues else ():
+        rows[tables[row["place"]]].append(row)
+    return rows
 
 
 def _candidates(table: Any, n: int, where: str | None, claims: Sequence[Claim]) -> Iterator[dict[str, Any]]:
@@ -187,7 +171,7 @@ def _candidates(table: Any, n: int, where: str | None, claims: Sequence[Claim]) 
         yield from _drawn(rows)
         if len(claims) == n_read < _SPREAD:  # the queue had no others, and other workers took none
             return
-    yield from _drawn(_ready({table: where}, n).get(table, []))
+    yield from _drawn(_ready({table: where}, n)[table])
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -222,8 +206,8 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
 
 def anything_reserved_here() -> bool:
     """Return whether a process of this machine works on a job."""
-    here = f"status='reserved' AND host='{escape_string(platform.node())}'"
-    return bool(having(dict.fromkeys(computed_tables(), here)))
+    here = {"host": platform.node()}
+    return any(exist(*(jobs_of(table).reserved & here for table in computed_tables())))
 
 
 def finish(job: Claim) -> None:

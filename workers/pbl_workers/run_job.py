@@ -20,7 +20,7 @@ from pbl_schemas.connection import DuplicateError, IntegrityError, LostConnectio
 from pbl_schemas.datajoint_setup import AWAY, FULL, REPEAT
 from pbl_schemas.job_errors import error_message, of_job
 from pbl_schemas.jobs import keys_of
-from pbl_schemas.rows import InputChanged
+from pbl_schemas.rows import InputChanged, exist
 from pbl_schemas.stored_files import remove_left_over
 
 from . import queue, recover
@@ -137,7 +137,7 @@ class _Attempt:
     def make(self) -> str:
         """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any longer); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
-        there, wanted = _there_and_wanted(self.job)
+        there, wanted = exist(table & key, _wanted(self.job))
         if there or not wanted:
             return ALREADY if there else VANISHED
         if self.computed is not None:
@@ -165,12 +165,9 @@ class _Attempt:
                 raise
 
 
-def _there_and_wanted(job: Claim) -> tuple[bool, bool]:
-    """Return whether the result is there, and whether its key can still be computed: its rows above exist, and it is
-    still requested."""
-    exist = (f"EXISTS ({(rows & job.key).make_sql()})" for rows in (job.table, keys_of(job.table)))
-    there, wanted = job.table.connection.query(f"SELECT {', '.join(exist)}").fetchone()
-    return bool(there), bool(wanted)
+def _wanted(job: Claim) -> Any:
+    """Query of the key, with a row if it can still be computed: its rows above exist, and it is still requested."""
+    return keys_of(job.table) & job.key
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
@@ -192,7 +189,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
     if isinstance(error, IntegrityError):  # a row above was deleted while we computed
         error = InputChanged(f"a row that the result refers to is gone ({error})", job)
     if isinstance(error, InputChanged):
-        if not _there_and_wanted(job)[1]:
+        if not _wanted(job):
             queue.finish(job)
             return Outcome(job, VANISHED)
         tried = job.attempts + 1
