@@ -108,7 +108,7 @@ def test_a_job_asks_the_database_for_rows_only_and_for_few(tables: None, tmp_pat
     _, *steps = worker_replay.record([video.VideoInfo])
     asked = [text for step in steps for text, _ in step]
     assert not [text for text in asked if "information_schema" in text or "SHOW " in text]
-    assert len(asked) / 4 <= 14  # four jobs a step, the server's clock among them
+    assert len(asked) / 4 <= 11  # four jobs a step, the server's clock among them
 
 
 # ------------------------------------------------------------------------------------------------- one job, one result
