@@ -42,8 +42,8 @@ def _c_library() -> Any:
 
 
 def fewer_collections() -> None:
-    """Let Python look for garbage in cycles a fourteenth as often: looking takes a tenth of the processor time of the
-    imports, and frees little, as arrays are not in cycles."""
+    """Let Python look for garbage in cycles at most a fifth as often: looking takes a tenth of the processor time of
+    the imports, and frees little, as arrays are not in cycles."""
     gc.set_threshold(10_000)
 
 

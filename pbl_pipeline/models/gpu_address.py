@@ -80,11 +80,11 @@ _FAILED = dict[tuple[str, str], tuple[float, RuntimeError]]()
 @functools.cache
 def _in_turn(_visible: str | None) -> tuple[str, ...]:
     """The GPUs of this process, first the one whose turn it is: each process takes the next one. "" for an unknown."""
-    import fcntl  # not on Windows, where JAX sees no GPU
-
     seen = given_gpus() or ("",)
-    if len(seen) == 1:
+    if len(seen) == 1 or sys.platform == "win32":
         return seen
+    import fcntl  # not on Windows
+
     with (private_folder("gpu") / "turn").open("a+b") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         file.seek(0)
@@ -101,7 +101,7 @@ def gpu_number() -> int:
 
 
 def _running(what: str, gpu: str) -> str:
-    import fcntl
+    import fcntl  # not on Windows, where JAX sees no GPU
 
     base = private_folder("gpu") / f"{_name(gpu)}-{what}"
     address = str(base.with_suffix(".sock"))

@@ -11,9 +11,10 @@ import json
 import os
 import warnings
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sized
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import INTERRUPTS, PblError
@@ -182,10 +183,14 @@ _insert = datajoint_table.Table.insert
 
 @functools.wraps(_insert)
 def _insert_in_parts(self: Any, rows: Any, *args: Any, **options: Any) -> None:
-    """DataJoint's own, which sends any number of rows in one statement, with `ROWS` in each."""
-    if not isinstance(rows, datajoint_table.QueryExpression) and not isinstance(rows, type):
-        options.setdefault("chunk_size", ROWS)
-    _insert(self, rows, *args, **options)
+    """DataJoint's own, which sends any number of rows in one statement: more than `ROWS` in several, all or none."""
+    if "chunk_size" in options or isinstance(rows, datajoint_table.QueryExpression | type | Path):
+        return _insert(self, rows, *args, **options)
+    rows = rows if isinstance(rows, Sized) else list(rows)
+    if len(rows) <= ROWS:
+        return _insert(self, rows, *args, **options)
+    with nullcontext() if self.connection.in_transaction else self.connection.transaction:
+        return _insert(self, rows, *args, chunk_size=ROWS, **options)
 
 
 datajoint_table.Table.insert = _insert_in_parts

@@ -51,8 +51,10 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
                     raise
                 time.sleep(random.uniform(0.0, _PAUSE_S))  # noqa: S311
                 continue
-            while _waiting and not _inside():
-                _waiting.pop(0)()
+            if not _inside():
+                calls, _waiting[:] = _waiting.copy(), []  # a call may be a transaction itself
+                for call in calls:
+                    call()
             return done
         raise AssertionError("unreachable")
 

@@ -119,6 +119,17 @@ def test_what_waits_for_a_commit_is_forgotten_with_the_transaction(tables: None)
     assert called[1:] == ["immediately"]
 
 
+def test_what_waits_for_a_commit_may_be_a_transaction_itself(tables: None):
+    called: list[int] = []
+
+    def decide() -> None:
+        for number in (1, 2, 3):
+            after_commit(lambda number=number: in_transaction(lambda: called.append(number)))
+
+    in_transaction(decide)
+    assert called == [1, 2, 3]
+
+
 def test_a_visit_without_a_usable_recording_has_no_set(visit: tuple[int, int]):
     for number in visit:
         review_decisions.mark_not_usable(number, "too_dark")

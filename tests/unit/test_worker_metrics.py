@@ -19,6 +19,7 @@ import pytest
 from prometheus_client.core import GaugeMetricFamily
 
 from pbl_pipeline import resources
+from pbl_pipeline.models.gpu_address import gpu_number
 from pbl_pipeline.resources import VISIBLE_GPUS, given_gpus
 from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
@@ -28,7 +29,7 @@ from pbl_workers.process import Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import Supervisor, _Child
-from tests import Environment, Limits, refused
+from tests import Environment, Limits, Machine, refused
 from tests.command import program
 from tests.ended_process import Ended
 
@@ -236,11 +237,24 @@ CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
 
 @pytest.mark.parametrize(
     ("listed", "expected"),
-    [("2,5", ("2", "5")), ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")), ("", ()), ("-1", ()), ("NoDevFiles", ())],
+    [
+        ("2,5", ("2", "5")),
+        ("2,-1,5", ("2",)),
+        ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")),
+        ("", ()),
+        ("-1", ()),
+        ("NoDevFiles", ()),
+    ],
 )
 def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, environment: Environment):
     environment(**{VISIBLE_GPUS: listed})
     assert given_gpus() == expected
+
+
+def test_one_gpu_needs_no_turn_nor_what_windows_lacks(environment: Environment, machine: Machine):
+    machine(without=["fcntl"])
+    environment(**{VISIBLE_GPUS: "GPU-of-windows"})
+    assert gpu_number() == 0
 
 
 @pytest.mark.parametrize(
@@ -329,6 +343,8 @@ def test_where_the_device_fails_the_process_ends_and_the_job_is_left_to_another(
     error = refused("DEVICE_UNAVAILABLE", run_job.run, job)
     assert error.found == "INTERNAL: CUDA error: device lost"
     assert counted == [(job, error.found)]
+    other = jax.errors.JaxRuntimeError("INVALID_ARGUMENT: shapes differ")
+    assert not run_job.device_failure(other)  # the next device would meet it too: an error row
 
 
 def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):

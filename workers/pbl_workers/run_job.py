@@ -46,6 +46,8 @@ ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
 STORE_GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EACCES)
 #: How long a job waits after such an error (s).
 STORE_WAIT_S = queue.LONGEST_WAIT_S
+#: Of which JAX's messages have one where a device does not compute.
+DEVICE_WORDS = ("CUDA", "RESOURCE_EXHAUSTED", "UNAVAILABLE")
 #: How long a result is kept for a database that is away, and the pause between two attempts to reach it (s).
 DATABASE_WAIT_S, DATABASE_PAUSE_S = 3600.0, 2.0
 
@@ -217,9 +219,13 @@ def cause_outside(error: BaseException) -> str | None:
 
 
 def device_failure(error: BaseException) -> str:
-    """Return JAX's message where the device does not compute, a GPU that is gone or has no memory left, else ""."""
+    """Return JAX's message where the device does not compute, a GPU that is gone or has no memory left, else "".
+
+    Any other error of JAX is one of the job, which the next device would meet too.
+    """
     seen = next((e for e in causes(error) if type(e).__name__ in ("JaxRuntimeError", "XlaRuntimeError")), None)
-    return " ".join(str(seen).split())[:200] if seen else ""
+    message = " ".join(str(seen).split())[:200]
+    return message if seen and any(word in message for word in DEVICE_WORDS) else ""
 
 
 def _no_device(job: Claim, reason: str) -> PblError:

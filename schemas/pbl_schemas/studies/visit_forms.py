@@ -273,7 +273,8 @@ def _correct(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tu
             return (), {next(iter(cells)): found.errors[0].with_key(None)}
     if errors:
         return (), errors
-    _write(now, changed, by, reason)
+    if changed:
+        _write(now, changed, by, reason)
     return tuple(changed), {}
 
 
