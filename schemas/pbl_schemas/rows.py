@@ -128,6 +128,12 @@ class ReadAhead:
         return self._tables[name]
 
 
+def exist(*queries: Any) -> list[bool]:
+    """Return for each query whether it has rows, by one statement."""
+    each = ", ".join(f"EXISTS ({query.make_sql()})" for query in queries)
+    return [bool(n) for n in queries[0].connection.query(f"SELECT {each}").fetchone()] if queries else []
+
+
 def utc_now() -> datetime.datetime:
     """Return the time in UTC by the clock of the database server for a datetime column: one clock for all machines."""
     return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]

@@ -61,11 +61,15 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
     return wrapper
 
 
+#: Statement after which the next transaction, and no other, sees what others have committed until each of its queries.
+READ_COMMITTED = "SET TRANSACTION ISOLATION LEVEL READ COMMITTED"
+
+
 @contextmanager
 def read_committed(connection: Any) -> Iterator[None]:
     """A transaction in which every query sees what others have committed, and not the state before a lock that it waits
     for; without locks on what it reads."""
-    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")  # of the next transaction only
+    connection.query(READ_COMMITTED)
     with connection.transaction:
         yield
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pbl_schemas import computed_tables, connection, datajoint_setup, fit, rows, study, video
+from pbl_schemas import computed_tables, connection, datajoint_setup, fit, rows, session, study, video
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.datajoint_setup import LIMIT_S
 from pbl_schemas.jobs import jobs_of
@@ -26,6 +26,7 @@ from tests import Environment, Limits, mysql, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.integration import chain
+from tests.rows import register
 
 pytestmark = pytest.mark.database
 
@@ -35,6 +36,25 @@ FEW, MANY, PART = 30, 90, 10
 PAGES = ("everything", "WARN", "ACCEPTED", "computed", "pending")
 #: Most statements of a command for each part of its visits.
 EACH_PART = 16
+#: Most statements of a populate of a visit with one walk: so many for each job, and for two looks at all tables.
+EACH_JOB, LOOKS = 32, 75
+
+
+def test_all_queues_are_asked_at_once(tables: None, tmp_path: Path):
+    of_all = [jobs_of(t).full_table_name for t in computed_tables()]
+    for name in ("first", "second", "third"):
+        register(chain.small_video(tmp_path, name), session_label=name)
+        visit = max(int(s) for s in session.Session.to_arrays("session_id"))
+        with growth.counted() as cost:
+            run = populate(visit=visit if name == "third" else None)
+        done = sum(table.done for table in run.tables)
+        assert done == len(of_all) - len(ON_REQUEST) + 1  # forces are planned
+        if name != "first":  # that reads the columns
+            assert cost.statements <= LOOKS + EACH_JOB * done
+            taken = [sql for sql in cost.texts if "status='pending'" in sql and sql.startswith("(SELECT")]
+            assert sum(all(queue in sql for queue in of_all) for sql in taken) <= done + 2
+            assert len(taken) <= 2 * done
+    assert growth.measured(populate).statements <= LOOKS
 
 
 def test_statements_stay_as_short_as_they_are(

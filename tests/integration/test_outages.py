@@ -394,7 +394,7 @@ def test_a_database_that_goes_away_in_the_middle_of_any_command_is_named(
         raise ValueError("while rows were read") from error
 
     monkeypatch.setattr("pbl_workers.recover.free_dead", lost)
-    monkeypatch.setattr("pbl_workers.requeue.retry", lost)
+    monkeypatch.setattr("pbl_workers.requeue.error_counts", lost)
     for command in ("release", "reprocess"):
         done = pbl("cron", command)
         assert (done.code, done.error_code) == (1, "DB_NOT_RUNNING"), done.err

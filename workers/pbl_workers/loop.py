@@ -17,6 +17,7 @@ from pbl_pipeline.video import release_frames
 from pbl_schemas import tables_version
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.visit_progress import Scope
+from pbl_schemas.rows import exist
 
 from . import queue, refresh, registry, run_job
 from .heartbeat import Silent
@@ -173,16 +174,11 @@ class Worker:
 
     def step(self) -> int:
         """Take jobs of the table that is most urgent, and do them; returns how many."""
-        ranked, conditions = [], self._conditions()
-        for position, table in enumerate(self.tables):
-            if table not in conditions:
-                continue
-            urgent = queue.most_urgent(table, conditions[table])
-            if urgent is not None:
-                ranked.append((urgent, -position, table))
+        conditions, position = self._conditions(), {table: i for i, table in enumerate(self.tables)}
+        ranked = [(urgent, -position[table], table) for table, urgent in queue.most_urgent(conditions).items()]
         if self.long_waits is not None and time.monotonic() - self._looked_for_long > LONG_EVERY_S:
             self._looked_for_long = time.monotonic()
-            longs = [p for table in self.tables if (p := queue.most_urgent(table, _IS_LONG)) is not None]
+            longs = queue.most_urgent(dict.fromkeys(self.tables, _IS_LONG)).values()
             if longs and min(longs) < min((p for p, *_ in ranked), default=math.inf):
                 self.long_waits()
         # What is near its end first: a session that is nearly done should not wait for all others to begin.
@@ -272,14 +268,14 @@ class Worker:
         if self.only is not None:
             scope = self.only()
             # Asked first: what a job makes computable that ends after this is found in the next round.
-            held = any(len(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None)
+            held = exist(*(jobs_of(t).reserved & w for t in self.tables if (w := scope.where(t)) is not None))
             found = refresh.refresh_scope(self.only())
             self.found.add(found)
             if found.queued or found.freed:
                 return True
             # Another worker may have queued a job since our last step and not taken it yet.
             ours = {} if self.limit is not None else self._conditions()
-            return None if held or any(queue.most_urgent(t, where) is not None for t, where in ours.items()) else False
+            return None if any(held) or queue.most_urgent(ours) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
         self.heartbeat.doing("looks at all tables")

@@ -13,7 +13,7 @@ from pbl_pipeline import progress
 from pbl_schemas import computed_tables, tracking
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading import visit_progress
-from pbl_schemas.reading.status import empty_rows
+from pbl_schemas.reading.status import EMPTY_COLUMNS, empty_rows
 
 from . import queue, refresh, run_job
 from .heartbeat import Silent
@@ -87,7 +87,7 @@ def populate(
     if retry_errors:
         of_visit = {t: True if only is None else only().where(t) for t in chosen}
         run.retried = sum(queue.reset_to_new(jobs_of(t).errors & w) for t, w in of_visit.items() if w is not None)
-    empty_before = {t: len(empty_rows(t)) for t in chosen}
+    empty_before = {t: len(empty_rows(t)) for t in chosen if t.__name__ in EMPTY_COLUMNS}
     found = (refresh.refresh(everything=True) if only is None else refresh.refresh_scope(only())) or refresh.Refreshed()
     with progress.bar("populate", total=_ready(chosen, limit), unit="row") as update:
         worker = Worker(chosen, Silent(), report=_counting(parts, chosen, limit, update), limit=limit, only=only)
@@ -99,15 +99,18 @@ def populate(
     run.freed, run.planned, run.dropped = found.freed, found.planned, found.dropped
     for table in chosen:
         part = parts[table.__name__]
-        part.empty = max(0, min(len(empty_rows(table)) - empty_before[table], part.done))
+        if part.done and table in empty_before:
+            part.empty = max(0, min(len(empty_rows(table)) - empty_before[table], part.done))
         if table is tracking.SubjectChoice:
             part.waiting = len(table & {"choice_status": "NEEDS_CHOICE"})
     return run
 
 
 def _ready(tables: Sequence[Any], limit: int | None) -> int:
-    counts = [len(jobs_of(t).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)") for t in tables]
-    return sum(n if limit is None else min(n, limit) for n in counts)
+    ready = "WHERE status='pending' AND scheduled_time <= CURRENT_TIMESTAMP(3)"
+    counts = " UNION ALL ".join(f"SELECT COUNT(*) FROM {jobs_of(t).full_table_name} {ready}" for t in tables)  # noqa: S608
+    found = jobs_of(tables[0]).connection.query(counts).fetchall()
+    return sum(int(n) if limit is None else min(int(n), limit) for (n,) in found)
 
 
 def _counting(

@@ -17,6 +17,7 @@ import os
 import platform
 import random
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -24,8 +25,8 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
-from pbl_schemas.rows import parts
-from pbl_schemas.transactions import read_committed, repeated
+from pbl_schemas.rows import exist, parts
+from pbl_schemas.transactions import READ_COMMITTED, repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
 
@@ -94,6 +95,8 @@ def fill(
     if where is not None:
         source = source & where
     todo = (source - table.proj()).restrict(dj.Not(jobs), semantic_check=False).proj()
+    if keys is None and not todo:  # so ends most of the looks at a whole table
+        return 0
     columns = ",".join(quote(c) for c in todo.heading.primary_key)
     names = f"{columns},{quote('status')},{quote('priority')}"
     values = f"{columns},'pending',IF({_is_long(source)},{LONG.get(priority, priority)},{int(priority)})"
@@ -116,8 +119,8 @@ def _is_long(keys: Any) -> str:
 def _committed(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
-    with read_committed(connection):
-        return statement()
+    connection.query(READ_COMMITTED)
+    return statement()  # alone it is that transaction
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
@@ -131,34 +134,44 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 
 
 # --------------------------------------------------------------------------------------------------- reserving, ending
-def most_urgent(table: Any, where: str | None = None) -> int | None:
-    """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
-    rows = _ready(table, 1, where)
+def most_urgent(wheres: Mapping[Any, str | None]) -> dict[Any, int]:
+    """Return the priority of the first job that can be taken now of each table (class) that has one, by one statement.
+    `wheres`: for each table a condition on the job's key."""
+    found = _ready(wheres, 1)
     if len(_read) >= _MOST_READ:
         _read.clear()
-    _read[table, where] = time.monotonic(), rows
-    return int(rows[0]["priority"]) if rows else None
+    _read.update({(table, wheres[table]): (time.monotonic(), rows) for table, rows in found.items()})
+    return {table: min(int(row["priority"]) for row in rows) for table, rows in found.items()}
 
 
-def _ready(table: Any, n: int, where: str | None) -> list[dict[str, Any]]:
-    """Return candidates for n jobs, the most urgent and oldest first. Plain SQL: half of DataJoint's time for a
-    query."""
-    jobs = jobs_of(table)
-    rows = jobs.connection.query(
-        f"SELECT {', '.join(jobs.primary_key)}, priority, attempts FROM {jobs.full_table_name}"  # noqa: S608
-        f" WHERE status='pending'{f' AND {where}' if where else ''} AND scheduled_time <= CURRENT_TIMESTAMP(3)"
-        f" ORDER BY priority, scheduled_time LIMIT {_SPREAD * n}",
-        as_dict=True,
-    )
-    return list(rows.fetchall())
+def _ready(wheres: Mapping[Any, str | None], n: int) -> dict[Any, list[dict[str, Any]]]:
+    """Return candidates for n jobs of each table that has some, the most urgent and oldest. Plain SQL: half of
+    DataJoint's time for a query."""
+    tables, queues = list(wheres), [jobs_of(table) for table in wheres]
+    keys = [jobs.primary_key for jobs in queues]
+    names, selects, rows = dict.fromkeys(name for key in keys for name in key), [], defaultdict(list)
+    for place, (jobs, key, where) in enumerate(zip(queues, keys, wheres.values(), strict=True)):
+        columns = ", ".join(name if name in key else f"NULL AS {name}" for name in names)
+        selects.append(
+            f"(SELECT {place} AS place, {columns}, priority, attempts FROM {jobs.full_table_name}"  # noqa: S608
+            f" WHERE status='pending'{f' AND {where}' if where else ''} AND scheduled_time <= CURRENT_TIMESTAMP(3)"
+            f" ORDER BY priority, scheduled_time LIMIT {_SPREAD * n})"
+        )
+    for row in queues[0].connection.query(" UNION ALL ".join(selects), as_dict=True) if queues else ():
+        rows[tables[row["place"]]].append(row)
+    return rows
 
 
-def _candidates(table: Any, n: int, where: str | None) -> Iterator[dict[str, Any]]:
-    """Yield candidates for n jobs in the order in which they are tried: those that were just read, then the queue's."""
+def _candidates(table: Any, n: int, where: str | None, claims: Sequence[Claim]) -> Iterator[dict[str, Any]]:
+    """Yield candidates for n jobs in the order in which they are tried: those that were just read, then the queue's.
+    `claims`: those that were reserved so far."""
     at, rows = _read.pop((table, where), (-math.inf, []))
     if time.monotonic() - at < KEPT_S:
+        n_read = len(rows)
         yield from _drawn(rows)
-    yield from _drawn(_ready(table, n, where))
+        if len(claims) == n_read < _SPREAD:  # the queue had no others, and other workers took none
+            return
+    yield from _drawn(_ready({table: where}, n)[table])
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -180,7 +193,7 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
         " AND attempts=%s AND status='pending' AND scheduled_time <= CURRENT_TIMESTAMP(3)"
     )
     claims: list[Claim] = []
-    for row in _candidates(table, n, where) if n else ():
+    for row in _candidates(table, n, where, claims) if n else ():
         key = {k: row[k] for k in jobs.primary_key}
         here = (platform.node(), os.getpid(), jobs.connection.connection_id)
         if jobs.connection.query(reserve, args=(*here, *key.values(), row["attempts"])).rowcount == 1:
@@ -194,7 +207,7 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
 def anything_reserved_here() -> bool:
     """Return whether a process of this machine works on a job."""
     here = {"host": platform.node()}
-    return any(len(jobs_of(table).reserved & here) for table in computed_tables())
+    return any(exist(*(jobs_of(table).reserved & here for table in computed_tables())))
 
 
 def finish(job: Claim) -> None:

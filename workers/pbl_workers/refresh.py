@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from pbl_schemas import chain, fit, review, tracking, video, worker
 from pbl_schemas.decisions.review_decisions import QUEUE
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.visit_progress import Scope, of_visit
-from pbl_schemas.rows import inside
+from pbl_schemas.rows import exist, inside
 from pbl_schemas.worker import installation_lock
 
 from . import queue, recover
@@ -137,7 +139,8 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
     from pbl_schemas.tracking import drop_outdated_choices
 
     out, tables = Refreshed(), chain.computed_tables()
-    for table in tables:
+    in_use = [*itertools.compress(tables, exist(*map(jobs_of, tables)))]  # the others have nothing to free or sweep
+    for table in in_use:
         out.freed += recover.free_dead(table)
     if not own:
         out.dropped = Counter(drop_outdated_choices())
@@ -147,9 +150,10 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
             out.queued += Counter({table.__name__: out.planned})
         where = None if scope is None else scope.where(table)
         if where is not None or scope is None:
-            out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
+            if table in in_use:
+                out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
             out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
-        elif not own:
+        elif not own and table in in_use:
             out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go immediately
     return out
 

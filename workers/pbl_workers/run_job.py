@@ -20,7 +20,7 @@ from pbl_schemas.connection import DuplicateError, IntegrityError, LostConnectio
 from pbl_schemas.datajoint_setup import AWAY, FULL, REPEAT
 from pbl_schemas.job_errors import error_message, of_job
 from pbl_schemas.jobs import keys_of
-from pbl_schemas.rows import InputChanged
+from pbl_schemas.rows import InputChanged, exist
 from pbl_schemas.stored_files import remove_left_over
 
 from . import queue, recover
@@ -139,10 +139,9 @@ class _Attempt:
     def make(self) -> str:
         """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any longer); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
-        if key in table:
-            return ALREADY
-        if not _is_wanted(self.job):
-            return VANISHED
+        there, wanted = exist(table & key, _wanted(self.job))
+        if there or not wanted:
+            return ALREADY if there else VANISHED
         if self.computed is not None:
             with contextlib.suppress(InputChanged):  # then it is computed again
                 self._insert(table, key, self.computed)
@@ -168,9 +167,9 @@ class _Attempt:
                 raise
 
 
-def _is_wanted(job: Claim) -> bool:
-    """Return whether the key can still be computed: its rows above exist, and it is still requested."""
-    return bool(keys_of(job.table) & job.key)
+def _wanted(job: Claim) -> Any:
+    """Query of the key, with a row if it can still be computed: its rows above exist, and it is still requested."""
+    return keys_of(job.table) & job.key
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
@@ -192,7 +191,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
     if isinstance(error, IntegrityError):  # a row above was deleted while we computed
         error = InputChanged(f"a row that the result refers to is gone ({error})", job)
     if isinstance(error, InputChanged):
-        if not _is_wanted(job):
+        if not _wanted(job):
             queue.finish(job)
             return Outcome(job, VANISHED)
         tried = job.attempts + 1

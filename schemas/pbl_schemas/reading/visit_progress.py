@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 from .. import computed_tables, fit, video
@@ -22,8 +23,13 @@ class Scope:
 
     def where(self, table: Any) -> str | None:
         """Return the condition on the first column of a table's key; None if no row can belong to these."""
-        if "fit_set" not in table.heading.primary_key:
-            return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
+        if "fit_set" in table.heading.primary_key:
+            return self._of_sets
+        return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
+
+    @functools.cached_property
+    def _of_sets(self) -> str | None:
+        """The condition on `fit_set`, of the sets that there are when it is first asked for."""
         rows: Any = fit.FitSet & f"session_id in ({','.join(map(str, self.sessions))})" if self.sessions else None
         if rows is not None and self.current:
             rows = rows & fit.current().proj()
