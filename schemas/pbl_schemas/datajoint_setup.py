@@ -6,15 +6,13 @@ the private names below and fails where a version of DataJoint has other ones.
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import warnings
 import weakref
-from collections.abc import Iterator, Sized
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import INTERRUPTS, PblError
@@ -83,8 +81,6 @@ FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
 LONGER = (1406,)
 #: That which says that it ended a query after `LIMIT_S`.
 TOO_LONG = (1969, 3024)
-#: Most rows of a statement that inserts.
-ROWS = 500
 #: Time after which the server ends a query (s), also of a process that was killed meanwhile.
 LIMIT_S = 600
 #: Rights that accounts of workers have (`pbl_schemas.operations.roles`), as the server names them when it refuses.
@@ -176,24 +172,6 @@ def backend_of(name: str) -> StorageBackend:
 def full_path(backend: Any, path: str) -> str:
     """Return the location of an object in a store: a path of the file system, or `bucket/key`."""
     return str(backend._full_path(path))
-
-
-_insert = datajoint_table.Table.insert
-
-
-@functools.wraps(_insert)
-def _insert_in_parts(self: Any, rows: Any, *args: Any, **options: Any) -> None:
-    """DataJoint's own, which sends any number of rows in one statement: more than `ROWS` in several, all or none."""
-    if "chunk_size" in options or isinstance(rows, datajoint_table.QueryExpression | type | Path):
-        return _insert(self, rows, *args, **options)
-    rows = rows if isinstance(rows, Sized) else list(rows)
-    if len(rows) <= ROWS:
-        return _insert(self, rows, *args, **options)
-    with nullcontext() if self.connection.in_transaction else self.connection.transaction:
-        return _insert(self, rows, *args, chunk_size=ROWS, **options)
-
-
-datajoint_table.Table.insert = _insert_in_parts
 
 
 @contextmanager

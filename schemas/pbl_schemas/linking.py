@@ -20,7 +20,7 @@ from pbl_pipeline.names import normalised_label
 
 from . import connection, lab, session
 from .datajoint_setup import MySQLOrMariaDB, dj
-from .rows import parts, rows_inside
+from .rows import insert_in_parts, parts, rows_inside
 from .transactions import in_transaction
 
 _usage = functools.partial(PblError, "USAGE", next_step='see docs/add_table.md, "Link your laboratory\'s tables"')
@@ -199,7 +199,7 @@ def _insert(master: Any, theirs: Any, wanted: Mapping[str, Any], found: Mapping[
         )
     columns, (ours,) = columns_of(theirs).items(), master.primary_key
     rows = ((number, found[name]) for name, number in wanted.items() if name in found)
-    master.Link.insert({ours: number, **{new: key[old] for new, old in columns}} for number, key in rows)
+    insert_in_parts(master.Link, ({ours: number, **{new: key[old] for new, old in columns}} for number, key in rows))
 
 
 def _without_link(master: Any, keys: Iterable[Any]) -> Collection[Any]:

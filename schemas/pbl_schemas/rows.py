@@ -128,6 +128,12 @@ class ReadAhead:
         return self._tables[name]
 
 
+def insert_in_parts(table: Any, rows: Iterable[Any], **options: Any) -> None:
+    """Insert any number of rows, at most `PART` in a statement: all or none only in a transaction of the caller's."""
+    for some in parts(rows):
+        table.insert(some, **options)
+
+
 def exist(*queries: Any) -> list[bool]:
     """Return for each query whether it has rows, by one statement."""
     each = ", ".join(f"EXISTS ({query.make_sql()})" for query in queries)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pbl_schemas import computed_tables, connection, datajoint_setup, fit, rows, session, study, video
+from pbl_schemas import computed_tables, connection, fit, rows, session, video
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.datajoint_setup import LIMIT_S
 from pbl_schemas.jobs import jobs_of
@@ -66,7 +66,6 @@ def test_statements_stay_as_short_as_they_are(
     limits: Limits,
 ):
     limits(rows, PART=PART)
-    limits(datajoint_setup, ROWS=PART)
     limits(requeue, CHUNK=PART)
     limits(workers, EACH=1)  # a video a visit
     environment(**{worker_standins.RECORDED: chain.small_video(tmp_path, "recorded")})
@@ -100,7 +99,6 @@ def test_statements_stay_as_short_as_they_are(
 
 def test_statements_of_sheets_do_not_grow_with_their_rows(tables: None, tmp_path: Path, limits: Limits):
     limits(rows, PART=PART)
-    limits(datajoint_setup, ROWS=PART)
     longest = []
     for n in (FEW, MANY):
         for score in ("11", "-"):  # stated, and removed again
@@ -144,17 +142,6 @@ def test_status_asks_for_names_once(tables: None):
         statements.append(growth.measured(pipeline_status).statements)
     assert len(state.errors) == len(state.not_usable) == workers.EACH
     assert statements[1] <= statements[0]
-
-
-def test_rows_of_several_statements_are_inserted_all_or_none(tables: None, limits: Limits):
-    limits(datajoint_setup, ROWS=PART)
-    names = [{"cohort": f"c{i}"} for i in range(2 * PART + 1)]
-    with pytest.raises(datajoint_setup.DuplicateError):
-        study.Cohort.insert(row for row in [*names, names[0]])
-    assert len(study.Cohort()) == 0
-    study.Cohort.insert(pd.DataFrame(names[:-1]))
-    study.Cohort.insert(names, skip_duplicates=True)
-    assert len(study.Cohort()) == len(names)
 
 
 @embedded_only

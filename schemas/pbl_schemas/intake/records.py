@@ -17,7 +17,7 @@ from pbl_pipeline.records import number
 from pbl_pipeline.texts import code_of
 
 from .. import fit, gait, gdi, kinetics, lab, linking, session, video
-from ..rows import counted, delete_below, inside, rows_inside, utc_now
+from ..rows import counted, delete_below, insert_in_parts, inside, rows_inside, utc_now
 from ..session import UNLABELLED
 from ..subject_codes import check_subject, day_of
 from ..transactions import next_id
@@ -257,15 +257,18 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
         first = next_id(session.Session, "session_id", len(missing))
         numbers |= {key: first + i for i, key in enumerate(missing)}
     dates, now = {(v.subject, v.session_label): v.date for v in visits if v.date is not None}, utc_now()
-    session.Session.insert(
-        {
-            "session_id": numbers[key],
-            "subject": key[0],
-            "session_label": key[1],
-            "session_date": dates.get(key) or day_of(key[1]),
-            "session_created": now,
-        }
-        for key in missing
+    insert_in_parts(
+        session.Session,
+        (
+            {
+                "session_id": numbers[key],
+                "subject": key[0],
+                "session_label": key[1],
+                "session_date": dates.get(key) or day_of(key[1]),
+                "session_created": now,
+            }
+            for key in missing
+        ),
     )
     linking.link_visits({key: numbers[key] for key in keys})
     for key, date in dates.items():
@@ -282,11 +285,11 @@ def add_people(visits: Iterable[VisitRecord]) -> None:
     visits = list(visits)
     codes = list(dict.fromkeys(v.subject for v in visits))
     projects = {v.subject: v.project for v in reversed(visits) if v.project}
-    lab.Project.insert(({"project": p} for p in {*projects.values()}), skip_duplicates=True)
+    insert_in_parts(lab.Project, ({"project": p} for p in {*projects.values()}), skip_duplicates=True)
     known = {r["subject"] for r in rows_inside(lab.Subject.proj(), "subject", codes)}
     about = {"population": "unknown", "subject_created": utc_now()}
     new = ({"subject": code, "project": projects.get(code), **about} for code in codes if code not in known)
-    lab.Subject.insert(new, skip_duplicates=True)
+    insert_in_parts(lab.Subject, new, skip_duplicates=True)
     linking.link_people(codes)
     for v in visits:
         set_population(v.subject, v.population)

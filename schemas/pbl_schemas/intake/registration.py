@@ -21,7 +21,7 @@ from ..methods import insert_once
 from ..operations import catalog
 from ..plan import default_fit
 from ..queues import forget_errors
-from ..rows import PART, inside, rows_inside, utc_now
+from ..rows import PART, insert_in_parts, inside, rows_inside, utc_now
 from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of
 from .records import (
@@ -215,13 +215,13 @@ def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Re
     for one, session_id in zip(recordings, of_session, strict=True):
         one.check_session(session_id)
     new = list(zip(recordings, of_session, numbers, strict=True))
-    video.Video.insert(row for one, session_id, own in new for row in _video_rows(one, session_id, own))
+    insert_in_parts(video.Video, (row for one, session_id, own in new for row in _video_rows(one, session_id, own)))
     paced = [(number, one.visit.pace) for one, _, own in new for number in own if one.visit.pace is not None]
     for number, pace in paced:
         set_condition(number, pace=pace)
     notes = [one.insert(own) for one, _, own in new]
     for table, rows in _selections([n for own in numbers for n in own], {*of_session}, chosen, set(METHOD_KEYS)):
-        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
+        insert_in_parts(table, rows, skip_duplicates=True)  # the session may have its plans already
     for one, _, own in new:
         if one.visit.person is not None:
             tracking.set_override({"video_id": own[0], "tracking_method": chosen["tracking_method"]}, one.visit.person)

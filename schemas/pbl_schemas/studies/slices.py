@@ -25,7 +25,7 @@ from ..method_names import with_keys
 from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..reading.slice_rows import slice_row
-from ..rows import PART, inside, rows_inside, utc_now
+from ..rows import PART, insert_in_parts, inside, rows_inside, utc_now
 from ..stored_files import file_ref, stored_file
 from ..transactions import in_transaction
 
@@ -120,16 +120,19 @@ def freeze(
                 "slice_created": utc_now(),
             }
         )
-        study.StudySliceVisit.insert(
-            {
-                "study_slice": name,
-                "session_id": r["session_id"],
-                "slice_included": r["included"],
-                "slice_reason": r["reason"],
-                "slice_fit_set": r["fit_set"],
-                "slice_visit_hash": hashes[r["subject"], r["visit"]],
-            }
-            for r in rows.to_dict("records")
+        insert_in_parts(
+            study.StudySliceVisit,
+            (
+                {
+                    "study_slice": name,
+                    "session_id": r["session_id"],
+                    "slice_included": r["included"],
+                    "slice_reason": r["reason"],
+                    "slice_fit_set": r["fit_set"],
+                    "slice_visit_hash": hashes[r["subject"], r["visit"]],
+                }
+                for r in rows.to_dict("records")
+            ),
         )
         return made
 

@@ -34,7 +34,7 @@ from ..intake.sheets import (
     refused,
     similar_codes,
 )
-from ..rows import inside, parts, rows_inside
+from ..rows import insert_in_parts, inside, parts, rows_inside
 from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
 
@@ -557,7 +557,8 @@ class _Plan:
         delete_forces(key["session_id"] for key, values in visits.values() if "assistive_device" in values)
         for key, stated in self.masses.items():
             set_mass(numbers[key], stated.values["body_mass"])
-        study.Cohort.insert(({"cohort": c} for c in sorted({c for c, _ in self.members})), skip_duplicates=True)
+        cohorts = ({"cohort": c} for c in sorted({c for c, _ in self.members}))
+        insert_in_parts(study.Cohort, cohorts, skip_duplicates=True)
         blank = {"member_included": True, "member_group": "", "member_reason": ""}
         members = {key: ({"cohort": key[0], "subject": key[1]}, s.values) for key, s in self.members.items()}
         _write(study.CohortMember, members, self.stored_members, blank)
@@ -565,14 +566,16 @@ class _Plan:
         gone = ({k: r[k] for k in ("session_id", "instrument")} for r in scores if r["score_value"] is None)
         for some in parts(gone):
             (study.ClinicalScore & some).delete_quick()
-        study.ClinicalScore.insert([r for r in scores if r["score_value"] is not None], replace=True)
+        entered = (r for r in scores if r["score_value"] is not None)
+        insert_in_parts(study.ClinicalScore, entered, replace=True)
         for stated in self.trials:
             set_condition(stated.values["video_id"], stated.values.get("activity"), stated.values.get("pace"))
 
 
 def _write(table: Any, stated: Mapping[Any, tuple[dict, dict]], stored: Mapping, blank: Mapping[str, Any]) -> None:
     """Insert the rows (key and values) that are new, with `blank` where nothing is stated, and update the others."""
-    table.insert({**key, **blank, **values} for name, (key, values) in stated.items() if name not in stored)
+    new = ({**key, **blank, **values} for name, (key, values) in stated.items() if name not in stored)
+    insert_in_parts(table, new)
     for name, (key, values) in stated.items():
         if name in stored:
             table.update1({**key, **values})
