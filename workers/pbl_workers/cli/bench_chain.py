@@ -46,7 +46,7 @@ class Measured:
 @click.option("--processes", type=Processes(), default="auto", show_default=True, help="As for `pbl worker`.")
 @click.option("--machines", type=click.IntRange(1), default=1, show_default=True, help="For how many is the cost.")
 @click.option("--seconds", type=click.FloatRange(0.1), help="Length of the recordings that the cost is for.")
-@click.option("--profile", is_flag=True, help="Also print the processor time by stage and by what is done.")
+@click.option("--profile", is_flag=True, help="Also print the processor time by stage and by what is done (Linux).")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
 def chain(
     video: Path | None,
