@@ -25,7 +25,7 @@ from tests.rows import everything, register
 #: What a page must never run, whatever it stands in.
 EVIL = '"><img src=x onerror=alert(1)><script>document.title="pwned"</script>'
 #: Addresses for phones, attacked in test_web_phone.py: no session is one, and no form is sent to them.
-OF_PHONES = {"/phone/look.json", "/phone/recordings.json", "/phone/finish/1.json"}
+OF_PHONES = {"/phone/look.json", "/phone/recordings.json", "/phone/sensors.json", "/phone/finish/1.json"}
 #: Forms that change nothing but what the sender sees.
 HARMLESS = {"/leave", "/language", "/visits"}
 
