@@ -87,6 +87,7 @@ EXPECTED = {
     "POST /phone/recordings.json": (PHONE, ""),
     "PUT /phone/recordings/1.json": (PHONE, ""),
     "POST /phone/finish/1.json": (PHONE, ""),
+    "POST /phone/sensors.json": (PHONE, ""),
     "GET /operate": (OPERATE, ""),
     "POST /operate/retry": (OPERATE, ""),
 }
