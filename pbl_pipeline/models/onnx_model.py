@@ -51,7 +51,9 @@ class OnnxModel:
         options.log_severity_level = 4  # its messages are raised below
         try:
             options_of = [{"device_id": gpu_number()} if p.startswith("CUDA") else {} for p in providers]
-            self._session = onnxruntime.InferenceSession(data, options, providers, options_of)
+            self._session = onnxruntime.InferenceSession(
+                data, options, providers=providers, provider_options=options_of
+            )
         except Exception as error:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
                 raise unavailable(_reason(error)) from error

@@ -164,7 +164,7 @@ def _measure(folder: Path, video: Path | None, n: int, options: Any, profile: bo
             original_bytes=n * len(film),
             result_bytes=_stored(folder) - before,
             jobs_s=jobs_s,
-            profile=[row for path in (folder / "profile").glob("*.json") for row in json.loads(path.read_text())],
+            profile=[row for p in (folder / "profile").glob("*.json") for row in json.loads(p.read_text("utf-8"))],
         )
     finally:
         embedded.stop(folder=embedded.Folder(folder / "db"))
