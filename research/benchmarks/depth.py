@@ -75,7 +75,7 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
     return out
 
 
-@click.command(help=__doc__.split("\n")[0])
+@click.command(help=(__doc__ or "").split("\n")[0])
 @click.option("--seeds", default=8, show_default=True, help="Persons in each view.")
 @click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first one.")
 @click.option("--views", default="sagittal,frontal", show_default=True)

@@ -144,7 +144,7 @@ def person(view: str, seed: int, wobble: float, params: str) -> Person:
     return dataclasses.replace(out, named=named, alarms=alarms)
 
 
-@click.command(help=__doc__.split("\n")[0])
+@click.command(help=(__doc__ or "").split("\n")[0])
 @click.option("--seeds", default=8, show_default=True, help="Persons in each view.")
 @click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first one.")
 @click.option("--wobble", default=1.0, show_default=True, help="Times the measured wobble.")

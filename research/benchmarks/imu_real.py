@@ -71,7 +71,7 @@ def foot(folder: Path, side: str) -> tuple[float, float]:
     return float(np.rad2deg(best[0])), float(np.rad2deg(best[1]))
 
 
-@click.command(help=__doc__.split("\n")[0])
+@click.command(help=(__doc__ or "").split("\n")[0])
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 def main(folder: Path) -> None:
     logs = {log.segment: log for log in read_given(given_sensors(str(folder / "opensense-walk" / "myIMUMappings.xml")))}

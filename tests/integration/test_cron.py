@@ -229,7 +229,7 @@ def test_a_file_that_a_killed_process_was_writing_is_removed(tables: None):
         file = Path(full_path(store, path))
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(b"0")
-        os.utime(file, times=2 * (time.time() - 8 * 86_400,))
+        os.utime(file, times=(old := time.time() - 8 * 86_400, old))
     done = pbl("cron", "disk", "--least-free", 0)
     assert "removed 1 that a killed process was writing" in done.out
     assert [f.path for f in orphans(young_s=0.0).orphans if f.path in paths] == paths[1:]
@@ -256,7 +256,7 @@ def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(
 
     def age() -> None:
         for note in (archive / PHONE).rglob("*"):
-            os.utime(note, times=2 * (time.time() - 8 * 86_400,))
+            os.utime(note, times=(old := time.time() - 8 * 86_400, old))
 
     take("walk", killed=False)
     whole = files(archive)
@@ -291,7 +291,7 @@ def test_a_note_of_the_same_bytes_under_another_ending_removes_no_registered_fil
     (film,) = (archive / name for name in before if name.endswith(".mp4"))
     note_placed(archive, film.with_suffix(".mov"))  # its process was killed before it could tell
     for note in (archive / PHONE).rglob("*"):
-        os.utime(note, times=2 * (time.time() - 8 * 86_400,))
+        os.utime(note, times=(old := time.time() - 8 * 86_400, old))
     pbl("cron", "release")
     assert files(archive) == before
 

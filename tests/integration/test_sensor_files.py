@@ -18,7 +18,7 @@ from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
-from tests import StandIn, worn_sensor
+from tests import StandIn, not_none, worn_sensor
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
@@ -230,7 +230,7 @@ def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: StandIn
     # The video ended or began 40 s after the sensors, give or take 10.
     assert 40 - 10 - 15 < row["sensor_clock"] < 40 - 10
     (trial,) = load_visit({"subject": "P001"}).fitted
-    assert plain(trial.fit.sensors) == plain([from_row(SensorFit, row)])
+    assert plain(not_none(trial.fit).sensors) == plain([from_row(SensorFit, row)])
 
 
 def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: StandIn):

@@ -254,16 +254,16 @@ def test_the_image_starts_as_any_user(user: str, monkeypatch: pytest.MonkeyPatch
             program(folder, "pbl", 'cat "$PBL_CACHE/assets/"*\n')
         finally:
             os.umask(before)
-        environment = {"PATH": f"{name}:/usr/bin:/bin", "PBL_SEED": f"{name}/seed", "PBL_CACHE": str(volume)}
+        given = {"PATH": f"{name}:/usr/bin:/bin", "PBL_SEED": f"{name}/seed", "PBL_CACHE": str(volume)}
         uid, gid = user.split(":")
         start = ["setpriv", f"--reuid={uid}", f"--regid={gid}", "--clear-groups", "sh", str(script)]
         for _ in range(2):  # and again
-            done = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+            done = subprocess.run(start, env=given, capture_output=True, text=True, check=False)
             assert (done.returncode, done.stdout, done.stderr) == (0, "model", "")
         assert [p.name for p in volume.rglob("*") if p.is_file()] == [model]
         (folder / "seed/assets/another").write_text("x")
         (folder / "seed/assets/another").chmod(0o600)
-        done = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(start, env=given, capture_output=True, text=True, check=False)
         assert done.returncode == 1
         assert "ASSET_MISSING: " in done.stderr
         assert "  next: " in done.stderr

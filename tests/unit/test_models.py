@@ -271,7 +271,7 @@ REAL_SESSION = onnxruntime.InferenceSession
 class Falls:
     """A runtime with a CUDA provider whose sessions begin on the CPU, as onnxruntime does without a driver."""
 
-    def __init__(self, *arguments, providers, provider_options=None, **more):
+    def __init__(self, *arguments, providers, provider_options, **more):
         assert providers[0] == "CUDAExecutionProvider"
         assert "device_id" in provider_options[0]
         self.inner = REAL_SESSION(*arguments, providers=["CPUExecutionProvider"], **more)

@@ -16,7 +16,7 @@ from pbl_pipeline.cli.options import sensor_logs
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.sensors import Given, SensorLog, check_day, given_sensors, named, read_given
 from pbl_pipeline.sensors.given import segment_of
-from tests import worn_sensor
+from tests import not_none, worn_sensor
 from tests.worn_sensor import Swing
 
 
@@ -174,7 +174,7 @@ def test_a_stated_mounting(tmp_path: Path):
         table.loc[0, [f"mount_{a}" for a in "wxyz"]] = wxyz
         given = f"pelvis={swing.write(tmp_path / 'a.csv', table)}"
         if length == "1":
-            np.testing.assert_allclose(read(given)[0].mounting, wxyz)
+            np.testing.assert_allclose(not_none(read(given)[0].mounting), wxyz)
         else:
             assert f"a mounting of length {length}" in refused(given).found
 

@@ -26,6 +26,7 @@ from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors,
 from pbl_pipeline.sensors.worn import worn
 from pbl_pipeline.synthetic import SynthSpec, Truth, synthesise
 from research.walker import sensors as synthetic
+from tests import not_none
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,10 @@ def test_strides_that_are_alike_need_a_stated_clock(truth, seen):
     log = synthetic.worn(truth, 3, ("shank_r",), rest_s=0, beyond_s=0, clock_s=0)[0][0]
     twice = np.concatenate([log.time, log.time + 3.0])
     repeated = dataclasses.replace(
-        log, time=twice, rate=np.tile(log.rate, (2, 1)), acceleration=np.tile(log.acceleration, (2, 1))
+        log,
+        time=twice,
+        rate=np.tile(not_none(log.rate), (2, 1)),
+        acceleration=np.tile(not_none(log.acceleration), (2, 1)),
     )
     with pytest.raises(ValueError, match="several times"):
         clock_of(seen, [oriented(repeated)], None)
