@@ -163,8 +163,8 @@ def _depths(found: DepthFit | None) -> list[Check]:
     """Checks of the depths; empty if there are none."""
     if found is None:
         return []
-    used, z = float(np.nanmin(found.used)), float(np.nanmax(found.z))
-    fits, ratio = float(np.nanmin(found.fits)), float(found.distance[np.isfinite(found.distance)][0])
+    used, fits, z = float(np.nanmin(found.used)), float(np.nanmin(found.fits)), float(np.nanmax(found.z))
+    ratio = found.distance
     return [
         Check(
             "depth_distance_ratio",

@@ -38,16 +38,16 @@ class DepthFit:
     """The depths of N trials, as a fit found them.
 
     `used` (N,): share of the used frames' large joints with a depth that was used, NaN without a recording; `fits`
-    (N,): share of the depths of joints in sight that lie where the person is; `distance` (N,): distance of the fit
-    without depths over theirs; `after` (N,): the same with them; `z` (N,): root mean square of their error in standard
-    deviations; `metre`: metres of the fit in one of theirs.
+    (N,): share of the depths of joints in sight that lie where the person is; `after` (N,): distance of the fit over
+    theirs; `z` (N,): root mean square of their error in standard deviations; `distance`: that of the fit without depths
+    over theirs, of all trials; `metre`: metres of the fit in one of theirs.
     """
 
     used: np.ndarray
     fits: np.ndarray
-    distance: np.ndarray
     after: np.ndarray
     z: np.ndarray
+    distance: float
     metre: float
 
 
@@ -153,13 +153,13 @@ def depth_fit(
     skin = np.asarray(seen.skin_m, float) + np.asarray(surface.offset_m, float)
     error = (z + skin - metre * depth) / sd_m
     rows, joints = list[tuple[float, ...]](), np.count_nonzero(_large(session))
-    before = float(start.surface.metre) / session.metre
     for i, arrays in enumerate(session.arrays):
         at = session.frames(i)
         n, e = count[at], error[at][count[at]]
         if not n.any():
-            rows.append((np.nan if session.depths[i] is None else 0.0, share[i], np.nan, np.nan, np.nan))
+            rows.append((np.nan if session.depths[i] is None else 0.0, share[i], np.nan, np.nan))
             continue
         after = float(np.median((z + skin)[at][n] / (metre * depth[at][n])))
-        rows.append((n.sum() / (arrays.used.sum() * joints), share[i], before, after, np.sqrt(np.mean(e**2))))
-    return DepthFit(*np.array(rows, float).T, metre=metre)
+        rows.append((n.sum() / (arrays.used.sum() * joints), share[i], after, np.sqrt(np.mean(e**2))))
+    distance = float(start.surface.metre) / session.metre
+    return DepthFit(*np.array(rows, float).T, distance=distance, metre=metre)

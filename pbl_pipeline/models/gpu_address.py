@@ -60,7 +60,8 @@ def running_server(what: str) -> str:
         The folder of its socket cannot be made.
     """
     error = RuntimeError("no GPU")
-    for gpu in _in_turn(os.environ.get(VISIBLE_GPUS)):
+    seen, turn = _in_turn(os.environ.get(VISIBLE_GPUS))
+    for gpu in (*seen[turn:], *seen[:turn]):
         at, failed = _FAILED.get((what, gpu), (-AGAIN_S, error))
         if time.monotonic() - at < AGAIN_S:
             error = failed
@@ -78,11 +79,12 @@ _FAILED = dict[tuple[str, str], tuple[float, RuntimeError]]()
 
 
 @functools.cache
-def _in_turn(_visible: str | None) -> tuple[str, ...]:
-    """The GPUs of this process, first the one whose turn it is: each process takes the next one. "" for an unknown."""
+def _in_turn(_visible: str | None) -> tuple[tuple[str, ...], int]:
+    """The GPUs of this process, "" for an unknown one, and the number of that whose turn it is: each process takes the
+    next one."""
     seen = given_gpus() or ("",)
     if len(seen) == 1 or sys.platform == "win32":
-        return seen
+        return seen, 0
     import fcntl  # not on Windows
 
     with (private_folder("gpu") / "turn").open("a+b") as file:
@@ -91,13 +93,12 @@ def _in_turn(_visible: str | None) -> tuple[str, ...]:
         turn = int(file.read() or 0) % len(seen)
         file.truncate(0)
         file.write(b"%d" % (turn + 1))
-    return (*seen[turn:], *seen[:turn])
+    return seen, turn
 
 
 def gpu_number() -> int:
     """Number of the GPU whose turn it is for this process, among those that it sees."""
-    seen = given_gpus() or ("",)
-    return seen.index(_in_turn(os.environ.get(VISIBLE_GPUS))[0])
+    return _in_turn(os.environ.get(VISIBLE_GPUS))[1]
 
 
 def _running(what: str, gpu: str) -> str:

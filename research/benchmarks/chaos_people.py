@@ -81,7 +81,7 @@ def decide(seed: int, start: int) -> None:
 
 @dataclasses.dataclass
 class People:
-    """What people and `cron` do at a site, and what became of it."""
+    """The work of people and of `cron` at a site, and its results."""
 
     site: phone_sends.Site
     registered: int = 0  # recordings whose persons may be forgotten
@@ -123,7 +123,7 @@ class People:
             raise
 
     def faults(self) -> list[tuple[float, Any]]:
-        """Faults of their own, beside those of `chaos`."""
+        """Faults beside those of `chaos`."""
         return [(1.0, self.site.kill_page), (1.0, self.kill_command), (0.5, self.kill_decider)]
 
     def kill_command(self) -> None:

@@ -181,7 +181,7 @@ trial_kinetics = remembered(compute.trial_kinetics)
 
 
 def install(patch: pytest.MonkeyPatch) -> None:
-    """Put the stand-ins in place of the library's functions, over tables and on files."""
+    """Use the stand-ins instead of the library's functions, over tables and on files."""
     patch.setattr(compute, "trial_kinetics", trial_kinetics)
     replace(patch, track_people=track_people, detect_keypoints=detect_keypoints, fit_session=fit_session)
 

@@ -731,7 +731,7 @@ def test_the_recording_of_one_visit_does_not_wait_for_that_of_another(visit: int
 
 
 def of_another(act: Callable[[], None]) -> Callable[..., None]:
-    """What another process does, whose tables no thread of ours asks."""
+    """The work of another process, whose tables no thread of ours asks."""
 
     def acted(*_: Any) -> None:
         with ThreadPoolExecutor(1) as other:

@@ -313,9 +313,10 @@ def test_depths_of_other_trials_are_refused():
 )
 def test_checks_of_depths(changed: dict[str, float], name: str, outcome: str):
     good = {"used": 0.5, "fits": 0.95, "distance": 0.92, "after": 1.0, "z": 1.1}
-    values = {k: np.array([v]) for k, v in (good | changed).items()}
-    values |= {k: np.append(values[k], np.nan) for k in good}  # a trial without a recording
-    checks = _depths(DepthFit(**values, metre=1.0))
+    values = good | changed
+    distance = values.pop("distance")
+    each = {k: np.array([v, np.nan]) for k, v in values.items()}  # the second is a trial without a recording
+    checks = _depths(DepthFit(**each, distance=distance, metre=1.0))
     assert [(c.check, c.outcome) for c in checks if c.outcome != PASS] == ([(name, outcome)] if name else [])
     assert _depths(None) == []
 
