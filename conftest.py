@@ -11,6 +11,7 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import importlib
 import importlib.util
@@ -115,39 +116,49 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
     return set_for_the_test
 
 
+class _Changes:
+    """Changes by `monkeypatch`, so that all of a test end in the reverse order of their beginning; with `end` these end
+    earlier."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._patch, self.end = patch, contextlib.ExitStack()
+
+    def setattr(self, where: Any, name: str, value: object) -> None:
+        where = importlib.import_module(where) if isinstance(where, str) else where
+        before = vars(where)[name] if isinstance(where, type) else getattr(where, name)
+        self.end.callback(self._patch.setattr, where, name, before)
+        self._patch.setattr(where, name, value)
+
+    def without(self, package: str) -> None:
+        """An import of this package raises ImportError."""
+        before = sys.modules.get(package)
+        back = functools.partial(self._patch.setitem, sys.modules, package, before)
+        self.end.callback(back if before else functools.partial(self._patch.delitem, sys.modules, package))
+        self._patch.setitem(sys.modules, package, None)  # type: ignore[arg-type]
+
+
 @pytest.fixture
-def until_the_end(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], tuple[pytest.MonkeyPatch, contextlib.ExitStack]]:
-    """Changes of the fixtures below, which end with their `with` or with the test: the last one first, and before those
-    of `monkeypatch`."""
-
-    def change() -> tuple[pytest.MonkeyPatch, contextlib.ExitStack]:
-        patch, end = pytest.MonkeyPatch(), contextlib.ExitStack()
-        end.callback(patch.undo)
-        request.addfinalizer(patch.undo)
-        return patch, end
-
-    return change
+def changes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], _Changes]:
+    """For the fixtures below: changes that end with their `with` or with the test."""
+    return lambda: _Changes(monkeypatch)
 
 
 @pytest.fixture
-def limits(until_the_end: Callable[..., Any]) -> Limits:
+def limits(changes: Callable[[], _Changes]) -> Limits:
     """Times, sizes and numbers that a module states as constants, for a test: `limits(loop, REFRESH_EVERY_S=0.1)`."""
 
     def are(module: ModuleType | str, **values: object) -> contextlib.ExitStack:
-        patch, end = until_the_end()
-        module = importlib.import_module(module) if isinstance(module, str) else module
+        patch = changes()
         for name, value in values.items():
             assert name.isupper(), f"{name} is not a constant"
             patch.setattr(module, name, value)
-        return end
+        return patch.end
 
     return are
 
 
 @pytest.fixture
-def machine(until_the_end: Callable[..., Any]) -> Machine:
+def machine(changes: Callable[[], _Changes]) -> Machine:
     """What the machine has, for a test: bytes free of 1 TB on every disk, the number of the account, no package of a
     name, no database server outside PATH, a GPU or the address of the process that computes on one."""
 
@@ -159,28 +170,28 @@ def machine(until_the_end: Callable[..., Any]) -> Machine:
         servers: bool = True,
         gpu: str | bool | None = None,
     ) -> contextlib.ExitStack:
-        patch, end = until_the_end()
+        patch = changes()
         if free_bytes is not None:
             disk = shutil.disk_usage("/")._replace(total=10**12, free=free_bytes)
             patch.setattr(shutil, "disk_usage", lambda _: disk)
         if account is not None:
             patch.setattr(os, "geteuid", lambda: account)
         for package in without:
-            patch.setitem(sys.modules, package, None)  # import raises ImportError
+            patch.without(package)
         if not servers:
-            patch.setattr("pbl_schemas.operations.embedded.binaries.PLACES", ())
-            patch.setattr("pbl_pipeline.cli.doctor._SERVER_PLACES", ())
+            patch.setattr("pbl_schemas.operations.embedded.binaries", "PLACES", ())
+            patch.setattr("pbl_pipeline.cli.doctor", "_SERVER_PLACES", ())
         if gpu is not None:
-            patch.setattr("pbl_pipeline.models.gpu_address.gpu_visible", lambda: bool(gpu))
+            patch.setattr("pbl_pipeline.models.gpu_address", "gpu_visible", lambda: bool(gpu))
         if isinstance(gpu, str):
-            patch.setattr("pbl_pipeline.models.gpu_address.running_server", lambda _: gpu)
-        return end
+            patch.setattr("pbl_pipeline.models.gpu_address", "running_server", lambda _: gpu)
+        return patch.end
 
     return has
 
 
 @pytest.fixture
-def faults(until_the_end: Callable[..., Any]) -> Faults:
+def faults(changes: Callable[[], _Changes]) -> Faults:
     """Lets a function fail: `faults(incoming, "register", None, OSError())` raises an error at the second call; returns
     the arguments of the calls, and works as before at the end of its `with`.
 
@@ -195,9 +206,9 @@ def faults(until_the_end: Callable[..., Any]) -> Faults:
         before: Callable[..., object] = lambda *_, **__: None,
         then: Callable[..., object] = lambda *_, **__: None,
     ) -> Calls:
-        patch, end = until_the_end()
+        patch = changes()
         where = importlib.import_module(where) if isinstance(where, str) else where
-        real, left, calls = getattr(where, name), list(errors), Calls(end)
+        real, left, calls = getattr(where, name), list(errors), Calls(patch.end)
 
         def fails(*args: Any, **options: Any) -> Any:
             calls.append(args)
@@ -218,11 +229,11 @@ def faults(until_the_end: Callable[..., Any]) -> Faults:
 
 
 @pytest.fixture
-def stand_in(until_the_end: Callable[..., Any]) -> StandIn:
+def stand_in(changes: Callable[[], _Changes]) -> StandIn:
     """Replaces stages of the chain by their names (`tests.integration.chain.STAGES`)."""
     from tests.integration import chain
 
-    return lambda **functions: chain.replace(until_the_end()[0], **functions)
+    return lambda **functions: chain.replace(changes(), **functions)
 
 
 @pytest.fixture

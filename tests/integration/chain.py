@@ -6,6 +6,7 @@ and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 
 import dataclasses
 import functools
+import importlib
 import json
 import tempfile
 import zlib
@@ -186,11 +187,11 @@ def install(patch: pytest.MonkeyPatch) -> None:
     replace(patch, track_people=track_people, detect_keypoints=detect_keypoints, fit_session=fit_session)
 
 
-def replace(patch: pytest.MonkeyPatch, **functions: Any) -> None:
+def replace(patch: Any, **functions: Any) -> None:
     """Put these functions instead of the stages of their names."""
     for name, function in functions.items():
         for module in STAGES[name]:
-            patch.setattr(f"{module}.{name}", function)
+            patch.setattr(importlib.import_module(module), name, function)
 
 
 def change_fits(patch: pytest.MonkeyPatch, change: Callable[[SessionFit], SessionFit]) -> None:
