@@ -34,8 +34,16 @@ _SAID = {
     "_missing": ("why it is null",),
     "_file": ("the file",),
 }
+#: Tables of the program's own work, which stand without their columns.
+_OWN = ("lab.Numbered", "capture.Phone", "worker.")
+#: What the top of the page states for all.
+_SHORTER = {
+    r"[,;] (null|empty) (when|where|if) (it was )?(not known|unknown|not estimated|not recorded)$": "",
+    r"[,;] null: not known$": "",
+    r"standard deviation\b": "sd",
+}
 #: Types that a reader asks the server for.
-_PLAIN = re.compile(r"float64|(var)?char\(\d+\)|int\d+|datetime(\(3\))?|date")
+_PLAIN = re.compile(r"bool|float64|(var)?char\(\d+\)|int\d+|datetime(\(3\))?|date")
 #: So many consecutive columns have to be alike to be described by those of another table.
 _LEAST_ALIKE = 4
 #: Longer names of columns do not widen the others'.
@@ -45,19 +53,19 @@ _START = """\
 # Tables
 
 Each section is a schema of the server, `pbl_<section>`, in the order of computing. `pbl populate` fills *computed* tables, people and `pbl ingest`
-those without a word; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
-has the key of its table. *as in* a table: the same columns without `session_`.
+those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part has the key
+of its table. *as in* a table: the same columns without `session_`.
 
-`T.heading` of a table T prints all types; below are those of terms, bool, json and files (`<object@arrays>`: [formats](files.md)). A column with a unit in
-brackets is float64 (*its unit*: that in the name of the row). Times are in UTC. Unless stated, `_created` is when the row was made, `_by` who decided,
-by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with
-a prefix:
+`T.heading` of a table T prints all types, and the columns of tables that have none here. Terms, json and files (`<object@arrays>`:
+[formats](files.md)) state their type, a column with a unit in brackets is float64 (*its unit*: that in the name of the row). Times are in UTC, sd is a
+standard deviation. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of the file,
+`_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
 
 - *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
 - *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
-  `_method_sha`, hash of all these
+  `_method_sha`, hash of all these. Lookup tables of frozen parameters have these columns only: @METHOD@
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
-  `_check_threshold` (its unit); `_check_advice`: what to do about it
+  `_check_threshold` (its unit); `_check_advice`: what to do about it. Parts with these columns only: @CHECK@
 
 Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
 """  # noqa: E501
@@ -73,9 +81,8 @@ and raises nothing: `lab.Subject * gdi.SessionGdi` has each person with the visi
 |---|---|---|
 | know their visit (`session_id`) | @VISIT@ | `T * session.Session * lab.Subject` |
 | know their video only | @VIDEO@ | `T * video.Video * session.Session * lab.Subject` |
-| two of these | any `A` and `B` | `A * video.Video * B`: a row of each video; two that know their visit: `A * B` |
-| of a part | `SessionGdi.Measure`, `GDI.Cycle`, ... | through its table: `gdi.SessionGdi.Measure * gdi.SessionGdi.proj('session_id')` |
-| of a person | `lab.Subject` | never without `session.Session` between it and results |
+| two of these | any `A` and `B` | `A * video.Video * B`; two that know their visit: `A * B` |
+| of a part | `SessionGdi.Measure`, ... | `gdi.SessionGdi.Measure * gdi.SessionGdi.proj('session_id')` |
 
 **Deleting results of chosen visits.** DataJoint 2.3.5 cannot delete where a restriction is itself restricted: "Attribute `pbl_session` is not found in
 query" ([cause](../research/reports/2026-11-29_datajoint_delete.md)). Restrict by the keys, and let results of the whole visit go along:
@@ -87,8 +94,7 @@ chosen = gdi.GDI & (session.Session & {"subject": "P001"})
 (gdi.GDI & chosen.keys()).delete(part_integrity="cascade", prompt=False)  # without prompt=False it asks first
 ```
 
-**A drawing of the tables.** `dj.Diagram(gdi.SessionGdi) - 2` in a notebook; `.save("tables.svg")` needs Graphviz and `pip install ipython`,
-`.save("tables.mmd")` writes Mermaid and needs neither.
+**A drawing of the tables.** `dj.Diagram(gdi.SessionGdi) - 2` in a notebook; `.save("tables.mmd")` writes Mermaid.
 """  # noqa: E501
 
 
@@ -120,15 +126,39 @@ def comment(cls: Any) -> str:
 
 def table_map() -> str:
     """The whole page."""
-    lines = [*_START.splitlines(), "", *joins()]
+    alone = {name: word for name, cls in tables().items() if (word := _alone(cls))}
+    start = _START
+    for word in _GROUPS:
+        start = _filled(start, f"@{word.upper()}@", _names([name for name in alone if alone[name] == word]))
+    lines = [*start.splitlines(), "", *joins()]
     stage, written = "", {}
     for name, cls in tables().items():
         if name.split(".")[0] != stage:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
-        lines += ["", f"### {name}{kind(cls)}", "", *([comment(cls), ""] if comment(cls) else [])]
-        lines += [f"    {line}" for line in _listed(name, cls, written)]
+        if name in alone:
+            continue
+        lines += ["", f"### {name}{kind(cls)}", *(["", comment(cls)] if comment(cls) else [])]
+        if not name.startswith(_OWN):
+            lines += ["", *(f"    {line}" for line in _listed(name, cls, written))]
     return "\n".join(lines) + "\n"
+
+
+def _alone(cls: Any) -> str:
+    """Word of the group that is all that a table has besides foreign keys of its own table, "" where it has more."""
+    own = [c[0] for c in columns(cls)]
+    word = _group(own, 0) if own else ""
+    return word if word and len(own) == len(_GROUPS[word]) else ""
+
+
+def _filled(text: str, place: str, words: str) -> str:
+    """The text with words for a place, its line broken anew."""
+    lines = (line.replace(place, words) for line in text.splitlines())
+    return "\n".join("\n".join(_wrapped(line, 150, "  ")) if words in line else line for line in lines)
+
+
+def _wrapped(text: str, width: int, below: str) -> list[str]:
+    return textwrap.wrap(text, width, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
 
 def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]:
@@ -173,6 +203,8 @@ def _meaning(column: str, type_: str, text: str, key: str) -> str:
         text = re.sub(r",? UTC$", "", text)
     text = re.sub(r"(: [^;]*)?; docs/files\.md$", "", text)
     text = "" if any(column.endswith(end) and text in said for end, said in _SAID.items()) else text
+    for long, short in _SHORTER.items():
+        text = re.sub(long, short, text)
     return text.replace(f"in the unit (see {key})", "(its unit)")
 
 
@@ -180,7 +212,7 @@ def _line(row: tuple[str, str, str], wide: int) -> list[str]:
     """A column with its type and meaning, broken below its name."""
     text = f"{row[0]:<{wide}}  {'  '.join(filter(None, row[1:]))}".rstrip()
     below = " " * (2 + wide * (len(row[0]) <= wide))
-    return textwrap.wrap(text, 130, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
+    return _wrapped(text, 130, below)
 
 
 def _group(names: list[str], i: int) -> str:
