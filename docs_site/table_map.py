@@ -1,4 +1,7 @@
-"""The map of all tables, made from their definitions: `python -m docs_site.table_map > docs/tables.md`."""
+"""The map of all tables, made from their definitions: `python -m docs_site.table_map > docs/tables.md`.
+
+docs/tables.md has the names of the columns with their units; the same page of the site also has what each column means.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ _SAID = {
     "_missing": ("why it is null",),
     "_file": ("the file",),
 }
-#: Tables of the program's own work, which stand without their columns.
+#: Tables of the program's own work, whose columns only the site has.
 _OWN = ("lab.Numbered", "capture.Phone", "worker.")
 #: What the top of the page states for all.
 _SHORTER = {
@@ -56,10 +59,10 @@ Each section is a schema of the server, `pbl_<section>`, in the order of computi
 those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part has the key
 of its table. *as in* a table: the same columns without `session_`.
 
-`T.heading` of a table T prints all types, and the columns of tables that have none here. Terms, json and files (`<object@arrays>`:
-[formats](files.md)) state their type, a column with a unit in brackets is float64 (*its unit*: that in the name of the row). Times are in UTC, sd is a
-standard deviation. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of the file,
-`_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
+@WHAT@
+Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*its unit*: that in the
+name of the row). Times are in UTC. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of
+the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
 
 - *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
 - *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
@@ -67,8 +70,15 @@ standard deviation. Unless stated, null means not known, `_created` when the row
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
   `_check_threshold` (its unit); `_check_advice`: what to do about it. Parts with these columns only: @CHECK@
 
-Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
+Made by `python -m docs_site.table_map`; do not edit.
 """  # noqa: E501
+#: Of a page without and with meanings.
+_WHAT = {
+    False: """\
+Here are the names of the columns. `T.heading` of a table T prints the type and meaning of each;
+so does this page in the site that `make docs` builds.""",
+    True: "`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.",
+}
 
 #: A natural join pairs every row with every row where two tables have no column in common that tells visits apart.
 _JOINS = """\
@@ -124,10 +134,10 @@ def comment(cls: Any) -> str:
     return ""
 
 
-def table_map() -> str:
-    """The whole page."""
+def table_map(*, meanings: bool = False) -> str:
+    """The whole page; `meanings`: with what each column means, and columns of the program's own tables."""
     alone = {name: word for name, cls in tables().items() if (word := _alone(cls))}
-    start = _START
+    start = _START.replace("@WHAT@", _WHAT[meanings])
     for word in _GROUPS:
         start = _filled(start, f"@{word.upper()}@", _names([name for name in alone if alone[name] == word]))
     lines = [*start.splitlines(), "", *joins()]
@@ -139,8 +149,8 @@ def table_map() -> str:
         if name in alone:
             continue
         lines += ["", f"### {name}{kind(cls)}", *(["", comment(cls)] if comment(cls) else [])]
-        if not name.startswith(_OWN):
-            lines += ["", *(f"    {line}" for line in _listed(name, cls, written))]
+        if meanings or not name.startswith(_OWN):
+            lines += ["", *(f"    {line}" for line in _listed(name, cls, written, meanings))]
     return "\n".join(lines) + "\n"
 
 
@@ -161,7 +171,7 @@ def _wrapped(text: str, width: int, below: str) -> list[str]:
     return textwrap.wrap(text, width, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
 
-def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]:
+def _listed(name: str, cls: Any, written: dict[str, list[_Column]], meanings: bool) -> list[str]:
     """The lines of a definition: groups by their word, those that a table before has as well by their names only."""
     own = [c for c in columns(cls) if not _is_origin(c[0], cls)]
     rows: list[_Column] = []
@@ -176,7 +186,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
             rows.append((f"{column}, ..., {own[i + n - 1][0]}", f"as in {alike}", "", in_key))
         else:
             said = (_type(type_), _meaning(column, type_, text, own[0][0]), in_key)
-            if rows and rows[-1][1:] == said:
+            if meanings and rows and rows[-1][1:] == said:
                 rows[-1] = (f"{rows[-1][0]}, {column}", *said)
             else:
                 rows.append((column, *said))
@@ -187,10 +197,20 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
         rows.append((f"{prefix}*", "origin", "", False))
     keys, others = ([row[:3] for row in rows if row[3] is key] for key in (True, False))
     of_key, of_row = _refers_to(name, cls)
+    if not meanings:
+        lines, below = ([*refers, *_names_only(part)] for refers, part in ((of_key, keys), (of_row, others)))
+        return [*lines, "---", *below] if lines and below else lines + below
     wide = max([len(row[0]) for row in rows if len(row[0]) <= _WIDEST] or [0])
     lines = [*of_key, *(line for row in keys for line in _line(row, wide))]
     below = [*of_row, *(line for row in others for line in _line(row, wide))]
     return [*lines, "---", *below] if lines and below else lines + below
+
+
+def _names_only(rows: list[tuple[str, str, str]]) -> list[str]:
+    """Columns with their unit and type, one after the other."""
+    units = [re.match(r"\([^)]*\)|", row[2]) for row in rows]
+    named = (" ".join(filter(None, (row[0], unit and unit[0], row[1]))) for row, unit in zip(rows, units, strict=True))
+    return _wrapped(", ".join(named), 130, "  ") if rows else []
 
 
 def _type(text: str) -> str:
