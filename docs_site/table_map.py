@@ -64,7 +64,7 @@ Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type,
 name of the row). Times are in UTC. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of
 the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
 
-- *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
+- *origin*, where a row of each computed table comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
 - *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
   `_method_sha`, hash of all these. Lookup tables of frozen parameters have these columns only: @METHOD@
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
@@ -104,7 +104,7 @@ chosen = gdi.GDI & (session.Session & {"subject": "P001"})
 (gdi.GDI & chosen.keys()).delete(part_integrity="cascade", prompt=False)  # without prompt=False it asks first
 ```
 
-**A drawing of the tables.** `dj.Diagram(gdi.SessionGdi) - 2` in a notebook; `.save("tables.mmd")` writes Mermaid.
+`dj.Diagram(gdi.SessionGdi) - 2` in a notebook draws the tables.
 """  # noqa: E501
 
 
@@ -193,7 +193,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]], meanings: bo
         i += len(_GROUPS[group]) if group else max(n, 1)
     written[name] = bare
     prefix = origin_prefix(cls)
-    if prefix is not None:
+    if prefix is not None and meanings:
         rows.append((f"{prefix}*", "origin", "", False))
     keys, others = ([row[:3] for row in rows if row[3] is key] for key in (True, False))
     of_key, of_row = _refers_to(name, cls)
@@ -208,7 +208,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]], meanings: bo
 
 def _names_only(rows: list[tuple[str, str, str]]) -> list[str]:
     """Columns with their unit and type, one after the other."""
-    units = [re.match(r"\([^)]*\)|", row[2]) for row in rows]
+    units = [re.match(r"\((?!-\))[^)]*\)|", row[2]) for row in rows]
     named = (" ".join(filter(None, (row[0], unit and unit[0], row[1]))) for row, unit in zip(rows, units, strict=True))
     return _wrapped(", ".join(named), 130, "  ") if rows else []
 
