@@ -37,7 +37,7 @@ _SAID = {
     "_missing": ("why it is null",),
     "_file": ("the file",),
 }
-#: Tables of the program's own work, whose columns only the site has.
+#: Tables of the program's own work, which only the site has.
 _OWN = ("lab.Numbered", "capture.Phone", "worker.")
 #: What the top of the page states for all.
 _SHORTER = {
@@ -76,7 +76,7 @@ Made by `python -m docs_site.table_map`; do not edit.
 _WHAT = {
     False: """\
 Here are the names of the columns. `T.heading` of a table T prints the type and meaning of each;
-so does this page in the site that `make docs` builds.""",
+so does this page in the site that `make docs` builds, which also has the tables of the program's own work: @OWN@.""",
     True: "`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.",
 }
 
@@ -135,9 +135,10 @@ def comment(cls: Any) -> str:
 
 
 def table_map(*, meanings: bool = False) -> str:
-    """The whole page; `meanings`: with what each column means, and columns of the program's own tables."""
+    """The whole page; `meanings`: with what each column means, and the program's own tables."""
     alone = {name: word for name, cls in tables().items() if (word := _alone(cls))}
-    start = _START.replace("@WHAT@", _WHAT[meanings])
+    own = _names([name for name in tables() if name.startswith(_OWN)])
+    start = _filled(_START.replace("@WHAT@", _WHAT[meanings]), "@OWN@", own)
     for word in _GROUPS:
         start = _filled(start, f"@{word.upper()}@", _names([name for name in alone if alone[name] == word]))
     lines = [*start.splitlines(), "", *joins()]
@@ -146,11 +147,10 @@ def table_map(*, meanings: bool = False) -> str:
         if name.split(".")[0] != stage:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
-        if name in alone:
+        if name in alone or (name.startswith(_OWN) and not meanings):
             continue
         lines += ["", f"### {name}{kind(cls)}", *(["", comment(cls)] if comment(cls) else [])]
-        if meanings or not name.startswith(_OWN):
-            lines += ["", *(f"    {line}" for line in _listed(name, cls, written, meanings))]
+        lines += ["", *(f"    {line}" for line in _listed(name, cls, written, meanings))]
     return "\n".join(lines) + "\n"
 
 
@@ -164,7 +164,9 @@ def _alone(cls: Any) -> str:
 def _filled(text: str, place: str, words: str) -> str:
     """The text with words for a place, its line broken anew."""
     lines = (line.replace(place, words) for line in text.splitlines())
-    return "\n".join("\n".join(_wrapped(line, 150, "  ")) if words in line else line for line in lines)
+    return "\n".join(
+        "\n".join(_wrapped(line, 150, "  " if line[0] in "- " else "")) if words in line else line for line in lines
+    )
 
 
 def _wrapped(text: str, width: int, below: str) -> list[str]:
