@@ -39,7 +39,7 @@ _SAID = {
 }
 #: Tables of the program's own work, which only the site has.
 _OWN = ("lab.Numbered", "capture.Phone", "worker.")
-#: What the top of the page states for all.
+#: Endings and words of a meaning that the top of the page states for all tables.
 _SHORTER = {
     r"[,;] (null|empty) (when|where|if) (it was )?(not known|unknown|not estimated|not recorded)$": "",
     r"[,;] null: not known$": "",
@@ -155,7 +155,7 @@ def table_map(*, meanings: bool = False) -> str:
 
 
 def _alone(cls: Any) -> str:
-    """Word of the group that is all that a table has besides foreign keys of its own table, "" where it has more."""
+    """Word of the group that is the only one of a table, "" where it has more columns."""
     own = [c[0] for c in columns(cls)]
     word = _group(own, 0) if own else ""
     return word if word and len(own) == len(_GROUPS[word]) else ""
