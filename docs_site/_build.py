@@ -50,8 +50,6 @@ def stage(folder: Path) -> Path:
     for path, target in where.items():
         file = ROOT / path
         text = _notebook.markdown(file) if file.suffix == ".ipynb" else file.read_text(encoding="utf-8")
-        if path == "docs/tables.md":
-            text = _tables()
         texts[target] = _outside_code(text, lambda t, path=path: _LINK.sub(lambda m: _link(m, path, where), t))
     for target, text in texts.items():
         (src / target).parent.mkdir(parents=True, exist_ok=True)
@@ -81,13 +79,6 @@ def build(folder: Path) -> Path:
     if done.returncode:
         raise BuildError(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr))
     return folder / "site"
-
-
-def _tables() -> str:
-    """The page of the tables, with what each column means."""
-    from .table_map import table_map  # is run as a program by itself
-
-    return table_map(meanings=True)
 
 
 def _outside_code(text: str, change: Callable[[str], str]) -> str:

@@ -1,7 +1,4 @@
-"""The map of all tables, made from their definitions: `python -m docs_site.table_map > docs/tables.md`.
-
-docs/tables.md has the names of the columns with their units; the same page of the site also has what each column means.
-"""
+"""The map of all tables, made from their definitions: `python -m docs_site.table_map > docs/tables.md`."""
 
 from __future__ import annotations
 
@@ -37,8 +34,6 @@ _SAID = {
     "_missing": ("why it is null",),
     "_file": ("the file",),
 }
-#: Tables of the program's own work, which only the site has.
-_OWN = ("lab.Numbered", "capture.Phone", "worker.")
 #: Endings and words of a meaning that the top of the page states for all tables.
 _SHORTER = {
     r"[,;] (null|empty) (when|where|if) (it was )?(not known|unknown|not estimated|not recorded)$": "",
@@ -59,7 +54,7 @@ Each section is a schema of the server, `pbl_<section>`, in the order of computi
 those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part has the key
 of its table. *as in* a table: the same columns without `session_`.
 
-@WHAT@
+`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.
 Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*its unit*: that in the
 name of the row). Times are in UTC. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of
 the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
@@ -72,14 +67,6 @@ the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it 
 
 Made by `python -m docs_site.table_map`; do not edit.
 """  # noqa: E501
-#: Of a page without and with meanings.
-_WHAT = {
-    False: """\
-Here are the names of the columns. `T.heading` of a table T prints the type and meaning of each;
-so does this page in the site that `make docs` builds, which also has the tables of the program's own work: @OWN@.""",
-    True: "`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.",
-}
-
 #: A natural join pairs every row with every row where two tables have no column in common that tells visits apart.
 _JOINS = """\
 ## Joins
@@ -134,11 +121,10 @@ def comment(cls: Any) -> str:
     return ""
 
 
-def table_map(*, meanings: bool = False) -> str:
-    """The whole page; `meanings`: with what each column means, and the program's own tables."""
+def table_map() -> str:
+    """The whole page."""
     alone = {name: word for name, cls in tables().items() if (word := _alone(cls))}
-    own = _names([name for name in tables() if name.startswith(_OWN)])
-    start = _filled(_START.replace("@WHAT@", _WHAT[meanings]), "@OWN@", own)
+    start = _START
     for word in _GROUPS:
         start = _filled(start, f"@{word.upper()}@", _names([name for name in alone if alone[name] == word]))
     lines = [*start.splitlines(), "", *joins()]
@@ -147,10 +133,10 @@ def table_map(*, meanings: bool = False) -> str:
         if name.split(".")[0] != stage:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
-        if name in alone or (name.startswith(_OWN) and not meanings):
+        if name in alone:
             continue
         lines += ["", f"### {name}{kind(cls)}", *(["", comment(cls)] if comment(cls) else [])]
-        lines += ["", *(f"    {line}" for line in _listed(name, cls, written, meanings))]
+        lines += ["", *(f"    {line}" for line in _listed(name, cls, written))]
     return "\n".join(lines) + "\n"
 
 
@@ -173,7 +159,7 @@ def _wrapped(text: str, width: int, below: str) -> list[str]:
     return textwrap.wrap(text, width, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
 
-def _listed(name: str, cls: Any, written: dict[str, list[_Column]], meanings: bool) -> list[str]:
+def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]:
     """The lines of a definition: groups by their word, those that a table before has as well by their names only."""
     own = [c for c in columns(cls) if not _is_origin(c[0], cls)]
     rows: list[_Column] = []
@@ -188,31 +174,21 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]], meanings: bo
             rows.append((f"{column}, ..., {own[i + n - 1][0]}", f"as in {alike}", "", in_key))
         else:
             said = (_type(type_), _meaning(column, type_, text, own[0][0]), in_key)
-            if meanings and rows and rows[-1][1:] == said:
+            if rows and rows[-1][1:] == said:
                 rows[-1] = (f"{rows[-1][0]}, {column}", *said)
             else:
                 rows.append((column, *said))
         i += len(_GROUPS[group]) if group else max(n, 1)
     written[name] = bare
     prefix = origin_prefix(cls)
-    if prefix is not None and meanings:
+    if prefix is not None:
         rows.append((f"{prefix}*", "origin", "", False))
     keys, others = ([row[:3] for row in rows if row[3] is key] for key in (True, False))
     of_key, of_row = _refers_to(name, cls)
-    if not meanings:
-        lines, below = ([*refers, *_names_only(part)] for refers, part in ((of_key, keys), (of_row, others)))
-        return [*lines, "---", *below] if lines and below else lines + below
     wide = max([len(row[0]) for row in rows if len(row[0]) <= _WIDEST] or [0])
     lines = [*of_key, *(line for row in keys for line in _line(row, wide))]
     below = [*of_row, *(line for row in others for line in _line(row, wide))]
     return [*lines, "---", *below] if lines and below else lines + below
-
-
-def _names_only(rows: list[tuple[str, str, str]]) -> list[str]:
-    """Columns with their unit and type, one after the other."""
-    units = [re.match(r"\((?!-\))[^)]*\)|", row[2]) for row in rows]
-    named = (" ".join(filter(None, (row[0], unit and unit[0], row[1]))) for row, unit in zip(rows, units, strict=True))
-    return _wrapped(", ".join(named), 130, "  ") if rows else []
 
 
 def _type(text: str) -> str:

@@ -1,6 +1,5 @@
 """The built site: whole, linked, and complete without a network. One build for all tests, some ten seconds."""
 
-import html
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -86,15 +85,6 @@ def test_every_public_name_of_the_library_appears(site: Path, pages: dict[Path, 
         ]
     assert sum(map(len, public.values())) > 500
     assert missing == []
-
-
-def test_the_page_of_the_tables_says_what_each_column_means(site: Path):
-    """In the site; the page of the repository has the names."""
-    shown = html.unescape((site / "tables.html").read_text(encoding="utf-8"))
-    means = "no feet show whether a step was missed"
-    assert means in shown
-    assert "last heartbeat, clock of the database server" in shown
-    assert means not in (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
 
 
 def test_every_command_appears(site: Path, pages: dict[Path, Page]):
