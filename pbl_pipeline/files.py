@@ -9,7 +9,8 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Collection, Iterator, Mapping
+import zipfile
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,17 @@ def sha256_of(path: str | Path) -> str:
     """SHA-256 of a file as 64 hex digits, computed in pieces. Raises OSError."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def zipped(folder: Path, copy: Path, names: Iterable[str], how: int = zipfile.ZIP_STORED) -> Path:
+    """Write files of a folder as a zip whose bytes depend on their names and contents only (packed: also on zlib)."""
+    with zipfile.ZipFile(copy, "w") as archive:
+        for name in sorted(names):
+            member = zipfile.ZipInfo(name)
+            member.compress_type = how
+            with (folder / name).open("rb") as source, archive.open(member, "w") as target:
+                shutil.copyfileobj(source, target)
+    return copy
 
 
 def load_npz(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float
 
@@ -13,6 +15,15 @@ from .recording import FARTHEST_M, Depth, Pictures
 #: Depths that differ by up to this (m) are of one surface; pixels that show one; confidence that counts; largest time
 #: (intervals) to the nearest picture.
 _SPREAD_M, _LEAST, _CONFIDENT, _NEAR = 0.05, 5, 1, 0.75
+
+
+@dataclasses.dataclass(frozen=True)
+class PointDepths:
+    """Depths (m) at the keypoints of a trial (`at_points`), with the name and the SHA-256 of their recording."""
+
+    m: Float[np.ndarray, "T J 2"]
+    name: str = ""
+    sha256: str = ""
 
 
 def at_points(depth: Depth, keypoints: Keypoints) -> Float[np.ndarray, "T J 2"]:

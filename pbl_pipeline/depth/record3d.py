@@ -21,9 +21,10 @@ from .recording import Depth, Pictures, depth_error
 _MOST = bounded.MIB
 
 
-def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
-    """Read a recording beside a video with pictures of this width and height. Raises `PblError` DEPTH_FILE;
-    PACKAGE_MISSING without the extra `depth`."""
+def read_record3d(path: Path, size_px: tuple[int, int], called: Path | None = None) -> Depth:
+    """Read a recording beside a video with pictures of this width and height; `called`: its name in errors. Raises
+    `PblError` DEPTH_FILE; PACKAGE_MISSING without the extra `depth`."""
+    shown = called or path
     lzfse = needed("lzfse", "the depths of Record3D")
 
     def read(frames: Iterable[int]) -> Iterator[Pictures]:
@@ -39,7 +40,7 @@ def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
             packed = bounded.read_member(archive, archive.getinfo(name), _MOST)
             return np.frombuffer(lzfse.decompress(bytes(packed)), kind).reshape(height, width)
         except (ValueError, lzfse.error, *bounded.DAMAGED) as error:
-            raise depth_error(f"{name}: {error}", f"{width}x{height} values", key=path) from error
+            raise depth_error(f"{name}: {error}", f"{width}x{height} values", key=shown) from error
 
     try:
         with bounded.opened_zip(path) as archive:
@@ -54,5 +55,5 @@ def read_record3d(path: Path, size_px: tuple[int, int]) -> Depth:
         if not members or stamps.ndim != 1 or order[-1] >= len(stamps):
             raise ValueError(f"{len(members)} depths up to {order[-1:]} and {np.shape(stamps)} times")
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, *bounded.DAMAGED) as error:
-        raise depth_error(f"no recording of Record3D ({error})", "the .r3d that the app exports", key=path) from error
-    return Depth(path, stamps[order] - stamps[0], size_px, matrix, None, read)
+        raise depth_error(f"no recording of Record3D ({error})", "the .r3d that the app exports", key=shown) from error
+    return Depth(shown, stamps[order] - stamps[0], size_px, matrix, None, read)
