@@ -26,7 +26,7 @@ import numpy as np
 
 import pbl_pipeline.synthetic.synth as synth
 from pbl_pipeline.body import load_body
-from pbl_pipeline.depth import at_points
+from pbl_pipeline.depth import PointDepths, at_points
 from pbl_pipeline.depth.recording import checked
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.fit.initial_pose import pelvis_path
@@ -62,7 +62,7 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
     camera.MIDDLE_M, camera.NEAREST_M = MIDDLE_M, NEAREST_M
     made = synthesise(SynthSpec(view=view, seconds=2.5, marker_set="blazepose_33", seed=seed))
     recording = checked(depth_recording(made.truth, made.keypoints, seed), made.truth.time_s)
-    depths, out = at_points(recording, made.keypoints), {}
+    depths, out = PointDepths(at_points(recording, made.keypoints)), {}
     for name, given in (("video", None), ("depth", depths)):
         begin = time.process_time()
         fit = fit_session([made.keypoints], ["walk"], params, depths=[given])
@@ -70,7 +70,8 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
         error, within = errors(fit, made.truth)
         path = pelvis_path(load_body(), np.asarray(fit.trials[0].qpos, float))[0]
         ratio = np.linalg.norm(path, axis=1) / np.linalg.norm(made.truth.pelvis_m, axis=1)
-        used, z = (np.nan, np.nan) if fit.depth is None else (float(fit.depth.used[0]), float(fit.depth.z[0]))
+        found = fit.trials[0].depth
+        used, z = (np.nan, np.nan) if found is None else (found.used, found.z)
         out[name] = Walk(error, within, float(np.nanmedian(ratio)), used, z, seconds)
     return out
 
