@@ -14,7 +14,7 @@ import numpy as np
 
 from pbl_pipeline import progress
 from pbl_pipeline.deidentify import to_show
-from pbl_pipeline.depth import DepthFile, PointDepths, point_depths, read_depth
+from pbl_pipeline.depth import DepthFile, PointDepths, at_points, read_depth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import METHODS as FIT_METHODS
@@ -184,7 +184,7 @@ def _detected(one: _Input) -> _Output:
         if one.log is not None:
             points = points.with_attitude(attitude_of(one.log[1], one.log[0], video))
         check_trial(points, one.name, one.fit)
-        depths = point_depths(recorded, points, one.depth) if recorded and one.depth else None
+        depths = None if recorded is None else at_points(recorded, points)
         return Recording.of(one.name, keypoints=points, path=one.path, video=video, choice=choice), None, depths
     except PblError as error:
         problem = choice.reason if choice is not None and choice.person_id is None else error.short()

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -24,7 +24,7 @@ from pbl_pipeline import bounded
 from pbl_pipeline.errors import said
 from pbl_pipeline.video import Camera, turned_camera
 
-from .packed import names_in, opened
+from .packed import Get, names_in, opened
 from .recording import Depth, Pictures, check_count, depth_error
 
 #: Bytes of a picture.
@@ -36,8 +36,6 @@ _MATRICES = "camera_matrix.csv", "depth_matrix.csv"
 _UPRIGHT = 0.5
 #: Errors of a file that is missing, damaged or too large, and of numbers in it.
 _UNREAD = (OSError, ValueError, KeyError, TypeError, cv2.error, *bounded.DAMAGED)
-
-_Get = Callable[[str, int], bytes]
 
 
 def read_folder(
@@ -78,9 +76,16 @@ def read_folder(
                 found = said("{n} depth pictures for {all} rows of odometry.csv", n=len(files), all=len(time_s))
                 raise wrong(found, "a picture of each frame, named by its number") from error
 
-        def picture(get: _Get, name: str) -> np.ndarray:
+        def picture(get: Get, name: str) -> np.ndarray:
             try:
-                return _picture(get(name, _MOST), name)
+                data = get(name, _MOST)
+                if name.lower().endswith(".npy"):
+                    found = np.load(io.BytesIO(data), allow_pickle=False)
+                else:
+                    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+                if found is None or found.ndim != 2:
+                    raise ValueError("no picture of one value a pixel")
+                return found
             except _UNREAD as error:
                 raise wrong(f"{PurePosixPath(name).name}: {error}", "a picture of one value a pixel") from error
 
@@ -90,7 +95,11 @@ def read_folder(
 
         def matrix(name: str, size_px: tuple[int, int]) -> np.ndarray | None:
             try:
-                return _matrix(get, name, size_px, turn) if name in names else None
+                if name not in names:
+                    return None
+                rows = io.StringIO(get(name, bounded.MAX_TEXT).decode("utf-8-sig"))
+                camera = Camera(np.loadtxt(rows, delimiter=",").reshape(3, 3), np.zeros(5), name)
+                return turned_camera(camera, size_px, turn).matrix
             except _UNREAD as error:
                 raise wrong(f"{name}: {error}", "3 rows of 3 numbers") from error
 
@@ -119,7 +128,7 @@ def _by_number(file: PurePosixPath) -> tuple[list[int], str]:
     return [int(n) for n in re.findall(r"\d+", file.stem)], file.name
 
 
-def _odometry(get: _Get) -> tuple[np.ndarray, int]:
+def _odometry(get: Get) -> tuple[np.ndarray, int]:
     """Times (s) of the frames from 0 on, and the clockwise turn (deg) that makes the pictures upright; 0 where the file
     does not state how the phone was held."""
     text = get("odometry.csv", bounded.MAX_TEXT).decode("utf-8-sig")
@@ -131,19 +140,3 @@ def _odometry(get: _Get) -> tuple[np.ndarray, int]:
     turns = turns[np.isfinite(turns).all(axis=1) & (np.linalg.norm(turns, axis=1) > 0.5)]
     x, y = np.median(Rotation.from_quat(turns).as_matrix()[:, 1, :2], axis=0) if len(turns) else (0.0, 0.0)
     return time - time[0], 0 if np.hypot(x, y) < _UPRIGHT else round(-1 - np.arctan2(y, x) / (np.pi / 2)) % 4 * 90
-
-
-def _matrix(get: _Get, name: str, size_px: tuple[int, int], turn_deg: int) -> np.ndarray:
-    text = get(name, bounded.MAX_TEXT).decode("utf-8-sig")
-    matrix = np.loadtxt(io.StringIO(text), delimiter=",").reshape(3, 3)
-    return turned_camera(Camera(matrix, np.zeros(5), name), size_px, turn_deg).matrix
-
-
-def _picture(data: bytes, name: str) -> np.ndarray:
-    if name.lower().endswith(".npy"):
-        picture = np.load(io.BytesIO(data), allow_pickle=False)
-    else:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.ndim != 2:
-        raise ValueError("no picture of one value a pixel")
-    return picture

@@ -13,6 +13,9 @@ from pbl_pipeline.temporary import new_folder
 
 #: What is read of a folder.
 _READ = re.compile(r"((depth|confidence)/)?[^/]+\.(png|npy)|(odometry|camera_matrix|depth_matrix)\.csv", re.IGNORECASE)
+#: Function from a file's path in a folder or a zip, and its most bytes, to its content. It raises OSError, ValueError,
+#: KeyError and `bounded.DAMAGED`.
+Get = Callable[[str, int], bytes]
 
 
 def names_in(path: Path) -> list[str]:
@@ -25,9 +28,8 @@ def names_in(path: Path) -> list[str]:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Callable[[str, int], bytes]]:
-    """Yield a function from a file's path in a folder or a zip, and its most bytes, to its content. It raises OSError,
-    ValueError, KeyError and `bounded.DAMAGED`."""
+def opened(path: Path) -> Iterator[Get]:
+    """Open a folder or a zip."""
     if path.is_dir():
         yield lambda name, most: bounded.read_bytes(path / name, most)
         return

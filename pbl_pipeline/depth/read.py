@@ -58,10 +58,12 @@ def read_depth(
     if not path.exists():
         raise PblError("FILE_MISSING", "no such file or folder", "a depth recording", "check the path", shown)
     if path.is_dir() or _zip_of_folder(path):
-        return checked(read_folder(path, time, size_px, scale_m, shown), time)
-    if scale_m is not None:
+        found = read_folder(path, time, size_px, scale_m, shown)
+    elif scale_m is not None:
         raise depth_error("a scale for a file", "a scale for a folder of 16-bit pictures", key=shown)
-    return checked(read_record3d(path, size_px, shown), time)
+    else:
+        found = read_record3d(path, size_px, shown)
+    return dataclasses.replace(checked(found, time), sha256=sha256_of_recording(path))
 
 
 def _zip_of_folder(path: Path) -> bool:
@@ -87,11 +89,5 @@ def with_recordings(
             raise PblError("USAGE", "--depth with markers", "keypoints of a video", "leave out --depth")
         depth = read_depth(given.file, trial.time_s, trial.image_size_px, given.scale_m, given.called)
         found.append(dataclasses.replace(trial, camera=depth.camera(trial.camera)))
-        depths.append(point_depths(depth, trial, given))
+        depths.append(at_points(depth, trial))
     return found, depths
-
-
-def point_depths(depth: Depth, keypoints: Keypoints, given: DepthFile) -> PointDepths:
-    """Return the depths of a recording at keypoints, with its name and its SHA-256."""
-    name, sha256 = Path(given.called or given.file).name, sha256_of_recording(given.file)
-    return PointDepths(at_points(depth, keypoints), name, sha256)

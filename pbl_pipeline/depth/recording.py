@@ -37,7 +37,8 @@ depth_error = functools.partial(
 class Depth:
     """A depth recording. `time_s` (N,): of its frames, 0 is the first; `size_px`: width and height of the video's
     pictures; `matrix` (3, 3) px: of those, `own_matrix`: of the depth pictures, None where the file does not state it
-    and both show the same; `read`: raw depths (m, H x W) and confidences (H x W, 0 to 2, or None) of some frames."""
+    and both show the same; `read`: raw depths (m, H x W) and confidences (H x W, 0 to 2, or None) of some frames;
+    `sha256`: of its file, or of a folder's zip."""
 
     path: Path
     time_s: np.ndarray
@@ -45,6 +46,7 @@ class Depth:
     matrix: np.ndarray | None
     own_matrix: np.ndarray | None
     read: Callable[[Iterable[int]], Iterator[Pictures]]
+    sha256: str = ""
 
     def camera(self, found: Camera) -> Camera:
         """The video's camera: that of the recording, unless the one that was found is calibrated or it states none.

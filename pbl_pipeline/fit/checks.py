@@ -162,8 +162,8 @@ def _depths(found: Sequence[DepthFit]) -> list[Check]:
     """Checks of the depths; empty if there are none."""
     if not found:
         return []
-    used, fits, z = min(d.used for d in found), np.nanmin([d.fits for d in found]), np.nanmax([d.z for d in found])
-    ratio = found[0].distance
+    used, ratio = min(d.used for d in found), found[0].distance
+    fits, z = float(np.nanmin([d.fits for d in found])), float(np.nanmax([d.z for d in found]))
     return [
         Check(
             "depth_distance_ratio",

@@ -139,7 +139,5 @@ def depth_fit(
     for i, (arrays, own) in enumerate(zip(session.arrays, session.depths, strict=True)):
         e = error[session.frames(i)][count[session.frames(i)]]
         used, rms = len(e) / (arrays.used.sum() * joints), float(np.sqrt(np.mean(e**2))) if len(e) else np.nan
-        of_all = {"distance": distance, "metre": metre}
-        known = own and DepthFit(own.name, own.sha256, float(used), float(share[i]), rms, **of_all)
-        found.append(known)
+        found.append(own and DepthFit(own.name, own.sha256, float(used), float(share[i]), rms, distance, metre))
     return tuple(found)

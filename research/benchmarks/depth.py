@@ -26,7 +26,7 @@ import numpy as np
 
 import pbl_pipeline.synthetic.synth as synth
 from pbl_pipeline.body import load_body
-from pbl_pipeline.depth import PointDepths, at_points
+from pbl_pipeline.depth import at_points
 from pbl_pipeline.depth.recording import checked
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.fit.initial_pose import pelvis_path
@@ -62,7 +62,7 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
     camera.MIDDLE_M, camera.NEAREST_M = MIDDLE_M, NEAREST_M
     made = synthesise(SynthSpec(view=view, seconds=2.5, marker_set="blazepose_33", seed=seed))
     recording = checked(depth_recording(made.truth, made.keypoints, seed), made.truth.time_s)
-    depths, out = PointDepths(at_points(recording, made.keypoints)), {}
+    depths, out = at_points(recording, made.keypoints), {}
     for name, given in (("video", None), ("depth", depths)):
         begin = time.process_time()
         fit = fit_session([made.keypoints], ["walk"], params, depths=[given])

@@ -280,8 +280,8 @@ def _people(sets: Any) -> Any:
 
 
 def _beside(key: Mapping[str, Any], lock: str = "") -> tuple[tuple, tuple]:
-    """What a set is fitted with beside its keypoints: bytes, segments and rates of the logs of wearable sensors, none
-    for markers; videos, bytes and scales of depth recordings, for videos of one camera. lock: clause by which a
+    """Recordings that a set is fitted with beside keypoints: bytes, segments and rates of the logs of wearable sensors,
+    none for markers; videos, bytes and scales of depth recordings, of one camera each. lock: clause by which a
     transaction sees what others have committed."""
     visit, kind = one(FitSet & {"fit_set": key["fit_set"]}, "session_id", "fit_set_kind")
     logs, depths = video.WearableImu.full_table_name, video.DepthVideo.full_table_name

@@ -225,7 +225,7 @@ def test_depth_at_a_point_is_that_of_one_surface():
         xy_px=np.tile(xy, (3, 1, 1)),
         confidence=np.ones((3, len(places))),
     )
-    found = at_points(depth, keypoints)
+    found = at_points(depth, keypoints).m
     nan = np.nan
     # On the limb, beside it, on the wall, in a small hole, in a large one, far, not confident, at the corner, outside.
     np.testing.assert_allclose(found[0, :, 0], [1.5, 3, 3, nan, nan, nan, nan, nan, nan], atol=0.011)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: As a path of `--attitude`, `--depth` or `--imu`: none for this video or at its visit, or no longer.
 NONE = "none"
-_NOT_READ = ", kept and not read: it is no folder, .r3d or zip (docs/depth.md)"
+_NOT_READ = ", kept and not read: not a folder, .r3d or zip (docs/depth.md)"
 
 
 @dataclasses.dataclass(frozen=True)
