@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -21,7 +21,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import said
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.video import Camera, turned_camera
 
 from .packed import Get, names_in, opened
@@ -75,46 +75,22 @@ def read_folder(
             except (ValueError, IndexError) as error:
                 found = said("{n} depth pictures for {all} rows of odometry.csv", n=len(files), all=len(time_s))
                 raise wrong(found, "a picture of each frame, named by its number") from error
-
-        def picture(get: Get, name: str) -> np.ndarray:
-            try:
-                data = get(name, _MOST)
-                if name.lower().endswith(".npy"):
-                    found = np.load(io.BytesIO(data), allow_pickle=False)
-                else:
-                    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-                if found is None or found.ndim != 2:
-                    raise ValueError("no picture of one value a pixel")
-                return found
-            except _UNREAD as error:
-                raise wrong(f"{PurePosixPath(name).name}: {error}", "a picture of one value a pixel") from error
-
-        height, width = map(int, picture(get, str(files[0])).shape)
+        height, width = map(int, _picture(get, str(files[0]), wrong).shape)
         turn = turn if width > height else 0  # they were turned before
         stored = (size_px[1], size_px[0]) if turn in (90, 270) else size_px
-
-        def matrix(name: str, size_px: tuple[int, int]) -> np.ndarray | None:
-            try:
-                if name not in names:
-                    return None
-                rows = io.StringIO(get(name, bounded.MAX_TEXT).decode("utf-8-sig"))
-                camera = Camera(np.loadtxt(rows, delimiter=",").reshape(3, 3), np.zeros(5), name)
-                return turned_camera(camera, size_px, turn).matrix
-            except _UNREAD as error:
-                raise wrong(f"{name}: {error}", "3 rows of 3 numbers") from error
-
-        of_video, own = matrix(_MATRICES[0], stored), matrix(_MATRICES[1], (width, height))
+        sizes = zip(_MATRICES, (stored, (width, height)), strict=True)
+        of_video, own = (_matrix(get, n, size, turn, wrong) if n in names else None for n, size in sizes)
     if own is not None and of_video is None:
         raise wrong(f"{_MATRICES[1]} alone", f"{_MATRICES[0]} beside it")
 
     def read(frames: Iterable[int]) -> Iterator[Pictures]:
         with opened(folder) as get:
             for i in frames:
-                depth, confidence = picture(get, str(files[i])), confidences.get(files[i].stem)
+                depth, confidence = _picture(get, str(files[i]), wrong), confidences.get(files[i].stem)
                 if depth.dtype != np.uint16:
                     bits = f"{files[i].name} of {8 * depth.itemsize} bits ({depth.dtype})"
                     raise wrong(bits, "16 bits a pixel, whole numbers")
-                sure = None if confidence is None else picture(get, confidence)
+                sure = None if confidence is None else _picture(get, confidence, wrong)
                 if sure is not None and sure.shape != depth.shape:
                     found = said("confidences of {a}, depths of {b}", a=sure.shape, b=depth.shape)
                     raise wrong(found, "pictures of one size, turned alike")
@@ -126,6 +102,29 @@ def read_folder(
 def _by_number(file: PurePosixPath) -> tuple[list[int], str]:
     """Order of pictures: that of the numbers in their names, with zeros before them or not."""
     return [int(n) for n in re.findall(r"\d+", file.stem)], file.name
+
+
+def _picture(get: Get, name: str, wrong: Callable[..., PblError]) -> np.ndarray:
+    try:
+        data = get(name, _MOST)
+        if name.lower().endswith(".npy"):
+            picture = np.load(io.BytesIO(data), allow_pickle=False)
+        else:
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if picture is None or picture.ndim != 2:
+            raise ValueError("no picture of one value a pixel")
+    except _UNREAD as error:
+        raise wrong(f"{PurePosixPath(name).name}: {error}", "a picture of one value a pixel") from error
+    return picture
+
+
+def _matrix(get: Get, name: str, size_px: tuple[int, int], turn_deg: int, wrong: Callable[..., PblError]) -> np.ndarray:
+    try:
+        rows = io.StringIO(get(name, bounded.MAX_TEXT).decode("utf-8-sig"))
+        camera = Camera(np.loadtxt(rows, delimiter=",").reshape(3, 3), np.zeros(5), name)
+    except _UNREAD as error:
+        raise wrong(f"{name}: {error}", "3 rows of 3 numbers") from error
+    return turned_camera(camera, size_px, turn_deg).matrix
 
 
 def _odometry(get: Get) -> tuple[np.ndarray, int]:

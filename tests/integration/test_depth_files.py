@@ -143,7 +143,7 @@ def test_a_real_fit_with_depths_has_their_metres(tmp_path: Path, stand_in: Stand
     for given in ("none", f"0.001={folder}"):
         ingested(path, "--depth", given)
         assert not errors(populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput", "SessionFit"]))
-        (trial,) = load_visit({"subject": "P001"}, measures=False).fitted
+        (trial,) = load_visit({"subject": "P001"}).fitted
         shown = not_none(trial.fit).markers_world_m
         distances.append(np.nanmedian(np.linalg.norm(np.nanmean(shown, axis=1), axis=1)))
     truth = np.median(np.linalg.norm(made.truth.markers_world_m.mean(axis=1), axis=1))

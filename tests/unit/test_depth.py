@@ -40,8 +40,9 @@ from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.video import Camera
 
 N, HEIGHT, WIDTH = 12, 24, 32
-#: A video of 4:3.
+#: A video of 4:3, and one of a phone that was turned.
 TIME_S, SIZE_PX = 7.0 + np.arange(N) / 30, (640, 480)
+PORTRAIT_PX = (480, 640)
 MATRIX = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
 
 
@@ -423,7 +424,7 @@ def test_a_zip_is_read_as_its_folder(tmp_path: Path):
 def test_pictures_of_a_turned_phone_are_turned_as_it_was_held(tmp_path: Path, turn: int):
     """The video is upright; what Stray Scanner writes lies as the sensor does."""
     upright = [np.rot90(depths(i), -turn // 90) for i in range(N)]
-    size = SIZE_PX[::-1] if turn % 180 else SIZE_PX
+    size, other = (PORTRAIT_PX, SIZE_PX) if turn % 180 else (SIZE_PX, PORTRAIT_PX)
     folder = stray(tmp_path / "a", held=turn)
     (folder / "camera_matrix.csv").write_text("600.0, 0.0, 325.0\n0.0, 610.0, 236.0\n0.0, 0.0, 1.0\n")
     found = read_depth(folder, TIME_S, size)
@@ -438,7 +439,7 @@ def test_pictures_of_a_turned_phone_are_turned_as_it_was_held(tmp_path: Path, tu
     np.testing.assert_allclose(np.diag(found.matrix)[:2], (610, 600) if turn % 180 else (600, 610))
     # The video lies on its side, or stands when the phone did not.
     with pytest.raises(PblError, match="turned by 90 deg") as caught:
-        read_depth(folder, TIME_S, size[::-1])
+        read_depth(folder, TIME_S, other)
     assert "so that the person is upright" in caught.value.next_step
     # Not known how it was held: pictures and video must agree.
     (folder / "odometry.csv").write_text("timestamp\n" + "".join(f"{t}\n" for t in TIME_S))
@@ -450,5 +451,5 @@ def test_pictures_of_a_turned_phone_are_turned_as_it_was_held(tmp_path: Path, tu
         write(by_hand / "depth", lambda i: np.rot90(millimetres(i), -1).copy())
         write(by_hand / "confidence", lambda i: np.full((WIDTH, HEIGHT), 2, np.uint8))
         (by_hand / "camera_matrix.csv").write_text("600, 0, 240\n0, 600, 320\n0, 0, 1\n")
-        (depth, _) = next(read_depth(by_hand, TIME_S, SIZE_PX[::-1]).read([3]))
+        (depth, _) = next(read_depth(by_hand, TIME_S, PORTRAIT_PX).read([3]))
         np.testing.assert_allclose(depth, np.rot90(depths(3), -1), atol=1e-3)
