@@ -13,6 +13,8 @@ from pbl_pipeline.temporary import new_folder
 
 #: What is read of a folder.
 _READ = re.compile(r"((depth|confidence)/)?[^/]+\.(png|npy)|(odometry|camera_matrix|depth_matrix)\.csv", re.IGNORECASE)
+#: Bytes of an archive's directory: 65,535 members, which is all that one can have.
+_DIRECTORY = 8 * bounded.MIB
 #: Function from a file's path in a folder or a zip, and its most bytes, to its content. It raises OSError, ValueError,
 #: KeyError and `bounded.DAMAGED`.
 Get = Callable[[str, int], bytes]
@@ -23,7 +25,7 @@ def names_in(path: Path) -> list[str]:
     if path.is_dir():
         found = (*path.glob("*"), *path.glob("*/*"))
         return sorted(f.relative_to(path).as_posix() for f in found if f.is_file())
-    with bounded.opened_zip(path) as archive:
+    with bounded.opened_zip(path, _DIRECTORY) as archive:
         return sorted(archive.namelist())
 
 
@@ -33,7 +35,7 @@ def opened(path: Path) -> Iterator[Get]:
     if path.is_dir():
         yield lambda name, most: bounded.read_bytes(path / name, most)
         return
-    with bounded.opened_zip(path) as archive:
+    with bounded.opened_zip(path, _DIRECTORY) as archive:
         yield lambda name, most: bytes(bounded.read_member(archive, archive.getinfo(name), most))
 
 

@@ -15,10 +15,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
 
 from .folders import read_folder
-from .packed import names_in, sha256_of_recording
+from .packed import sha256_of_recording
 from .points import PointDepths, at_points
 from .record3d import read_record3d
 from .recording import Depth, checked, depth_error
+
+_RECORD3D = ".r3d"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +44,7 @@ class DepthFile:
     @property
     def known(self) -> bool:
         """True if its kind of file can be read."""
-        return self.file.is_dir() or self.file.suffix.lower() in (".r3d", ".zip")
+        return self.file.is_dir() or self.file.suffix.lower() in (_RECORD3D, ".zip")
 
 
 def read_depth(
@@ -57,19 +59,13 @@ def read_depth(
     time, shown = np.asarray(time_s, float) - float(time_s[0]), Path(called or path)
     if not path.exists():
         raise PblError("FILE_MISSING", "no such file or folder", "a depth recording", "check the path", shown)
-    if path.is_dir() or _zip_of_folder(path):
+    if shown.suffix.lower() != _RECORD3D or path.is_dir():
         found = read_folder(path, time, size_px, scale_m, shown)
     elif scale_m is not None:
         raise depth_error("a scale for a file", "a scale for a folder of 16-bit pictures", key=shown)
     else:
         found = read_record3d(path, size_px, shown)
     return dataclasses.replace(checked(found, time), sha256=sha256_of_recording(path))
-
-
-def _zip_of_folder(path: Path) -> bool:
-    with contextlib.suppress(OSError, ValueError):
-        return "metadata" not in names_in(path)  # as Record3D's has
-    return False
 
 
 def with_recordings(
