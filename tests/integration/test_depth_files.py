@@ -127,7 +127,7 @@ def test_files_of_another_kind_are_kept_and_not_read(tmp_path: Path):
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_real_fit_with_depths_has_their_metres(tmp_path: Path, stand_in: StandIn):
-    """Pictures of the walker's body, as 16-bit PNG through intake, store and fit."""
+    """Pictures of the walker's body, as 16-bit PNG through intake, store and fit; a scale that is 1.1 times too large."""
     made = synthesise(SynthSpec(view="frontal", seconds=1.5, marker_set="blazepose_33", seed=511))
     points, n = made.keypoints, len(made.truth.time_s)
     recording = depth_recording(made.truth, points, 511)
@@ -139,16 +139,16 @@ def test_a_real_fit_with_depths_has_their_metres(tmp_path: Path, stand_in: Stand
 
     stand_in(detect_keypoints=detect_keypoints, fit_session=session_fit.fit_session)
     path = chain.small_video(tmp_path, "a", n)
-    distances = []
-    for given in ("none", f"0.001={folder}"):
+    ratios = list[float]()
+    for given in ("none", f"0.0011={folder}"):
         ingested(path, "--depth", given)
         assert not errors(populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput", "SessionFit"]))
         (trial,) = load_visit({"subject": "P001"}).fitted
-        shown = not_none(trial.fit).markers_world_m
-        distances.append(np.nanmedian(np.linalg.norm(np.nanmean(shown, axis=1), axis=1)))
-    truth = np.median(np.linalg.norm(made.truth.markers_world_m.mean(axis=1), axis=1))
-    assert abs(distances[1] / truth - 1) < 0.02
-    assert abs(distances[0] / truth - 1) > 0.02
+        found = not_none(trial.fit)
+        hip = found.marker_names.index("left_hip")
+        away = (np.linalg.norm(x[:, hip], axis=1) for x in (found.markers_world_m, made.truth.markers_world_m))
+        ratios.append(float(np.nanmedian(np.divide(*away))))
+    assert ratios == pytest.approx([1.0, 1.1], abs=0.02)
     row = fit.SessionFit.Depth.fetch1()
     assert row["depths_used"] > 0.3
     checks = {c["fit_check"] for c in fit.SessionFit.Check.to_dicts()}
