@@ -127,7 +127,7 @@ def test_files_of_another_kind_are_kept_and_not_read(tmp_path: Path):
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_real_fit_with_depths_has_their_metres(tmp_path: Path, stand_in: StandIn):
-    """Pictures of the walker's body, as 16-bit PNG through intake, store and fit; a scale that is 1.1 times too large."""
+    """Pictures of the walker as 16-bit PNG, with a scale that is 1.1 times too large, through intake, store and fit."""
     made = synthesise(SynthSpec(view="frontal", seconds=1.5, marker_set="blazepose_33", seed=511))
     points, n = made.keypoints, len(made.truth.time_s)
     recording = depth_recording(made.truth, points, 511)
