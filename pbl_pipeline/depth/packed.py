@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pbl_pipeline import bounded
-from pbl_pipeline.files import sha256_of, zipped
-from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.files import sha256_packed, zipped
 
 #: What is read of a folder.
 _READ = re.compile(r"((depth|confidence)/)?[^/]+\.(png|npy)|(odometry|camera_matrix|depth_matrix)\.csv", re.IGNORECASE)
@@ -46,7 +45,4 @@ def pack(folder: Path, copy: Path) -> Path:
 
 def sha256_of_recording(path: Path) -> str:
     """SHA-256 of a file, or of the zip of a folder (`pack`)."""
-    if path.is_file():
-        return sha256_of(path)
-    with new_folder() as folder:
-        return sha256_of(pack(path, folder / "depth.zip"))
+    return sha256_packed(path, pack)

@@ -95,9 +95,7 @@ class SessionFit(dj.Computed):
     Sensor = part_of(
         "Sensor", SensorFit, comment="what was found of a wearable sensor in a trial", of=("master", "FitSet.Video")
     )
-    Depth = part_of(
-        "Depth", DepthFit, comment="what was found of the depth recording of a trial", of=("master", "FitSet.Video")
-    )
+    Depth = part_of("Depth", DepthFit, comment="what was found of a depth recording", of=("master", "FitSet.Video"))
 
     @property
     def key_source(self) -> Any:

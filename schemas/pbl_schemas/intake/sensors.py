@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import sha256_of, zipped
+from pbl_pipeline.files import sha256_packed, zipped
 from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
 
@@ -64,7 +64,7 @@ class Sensors:
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
         files = {self.attitude, *(given.file for given in imu)} - {None, Path(NONE)}
-        sums = {path: _sha256(path) for path in files if path is not None}
+        sums = {path: sha256_packed(path, _zipped) for path in files if path is not None}
         sums |= {path: sha256_of_recording(path) for path in depth - {Path(NONE)}}
         return dataclasses.replace(self, imu=imu, sums=sums), log
 
@@ -128,6 +128,7 @@ def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: 
 
 
 def _attach_depth(key: dict[str, Any], given: DepthFile, sums: Mapping[Path, str]) -> list[str]:
+    """Attach a depth recording to a video, or remove its older one, and delete the fits that were made otherwise."""
     from pbl_pipeline.depth import pack
 
     table, removed = video.DepthVideo & key, str(given.file) == NONE
@@ -220,14 +221,6 @@ def carriers(numbers: Sequence[int]) -> list[dict[str, Any]]:
     """Keys of the logs of wearable sensors that are attached to these videos and belong to their visit."""
     rows = (video.WearableImu & [{"video_id": v} for v in numbers]).proj("imu_segments").to_dicts()
     return [row for row in rows if row["imu_segments"]]
-
-
-def _sha256(path: Path) -> str:
-    """Of a file's bytes, or of those of a folder's zip."""
-    if path.is_file():
-        return sha256_of(path)
-    with new_folder() as folder:
-        return sha256_of(_zipped(path, folder / "log.zip"))
 
 
 def _keep(
