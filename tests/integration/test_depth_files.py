@@ -70,6 +70,7 @@ def test_a_depth_recording_is_part_of_the_fit_of_its_visit(tmp_path: Path):
 
 
 def test_a_wrong_recording_is_an_error_of_its_own_fit(tmp_path: Path):
+    pytest.importorskip("lzfse")
     one, two = (chain.small_video(tmp_path, name) for name in ("a", "b"))
     empty = chain.depth_pictures(tmp_path / "zeros", 0.0)
     (tmp_path / "broken.r3d").write_bytes(b"no zip")

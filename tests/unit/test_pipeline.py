@@ -80,11 +80,10 @@ def test_the_report_of_a_run_is_german_where_that_is_asked_for(
 def test_report_and_session_name_the_depth_recording_of_a_run(
     fitted: list[list[str]], tmp_path: Path, stand_in: StandIn
 ):
-    def detect(*args, **options):
-        points = chain.detect_keypoints(*args, **options)  # of a small video
-        return dataclasses.replace(
-            points, xy_px=points.xy_px * (128 / points.image_size_px[0]), image_size_px=(128, 72)
-        )
+    def detect(video_path, tracking, person_id, camera, params=None):  # of a small video
+        points = chain.detect_keypoints(video_path, tracking, person_id, camera, params)
+        small = points.xy_px * (128 / points.image_size_px[0])
+        return dataclasses.replace(points, xy_px=small, image_size_px=(128, 72), camera=camera)
 
     stand_in(**chain.NO_PICTURES, detect_keypoints=detect, fit_session=chain.fit_session)
     paths = [str(chain.small_video(tmp_path, name)) for name in ("walk", "without", "wrong")]
