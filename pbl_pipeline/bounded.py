@@ -170,10 +170,10 @@ def count_cells(n: int, columns: int = 0) -> None:
 
 
 @contextlib.contextmanager
-def opened_zip(path: str | Path) -> Iterator[zipfile.ZipFile]:
-    """A zip archive to read members of (`read_member`), whose directory is small."""
+def opened_zip(path: str | Path, directory: int = _MAX_DIRECTORY) -> Iterator[zipfile.ZipFile]:
+    """A zip archive to read members of (`read_member`), whose directory is small: of up to this many bytes."""
     with _opened(path) as file:
-        _check_directory(file)
+        _check_directory(file, directory)
         try:
             with zipfile.ZipFile(file) as archive:
                 yield archive
@@ -198,7 +198,7 @@ def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, at_most: int)
     return data
 
 
-def _check_directory(file: BinaryIO) -> None:
+def _check_directory(file: BinaryIO, at_most: int) -> None:
     """The end of a zip archive (APPNOTE 4.3.16) names a small directory, before anything reads that."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 65557))  # the record and the longest comment
@@ -208,8 +208,8 @@ def _check_directory(file: BinaryIO) -> None:
     if at < 0 or at + 22 > len(end):
         raise ValueError("no zip archive, or one that is cut off")
     length = int.from_bytes(end[at + 12 : at + 16], "little")
-    if length > _MAX_DIRECTORY or b"PK\6\7" in end[max(0, at - 20) : at]:
-        raise ValueError(f"an archive whose directory has more than {_size(_MAX_DIRECTORY)}")
+    if length > at_most or b"PK\6\7" in end[max(0, at - 20) : at]:
+        raise ValueError(f"an archive whose directory has more than {_size(at_most)}")
 
 
 def npz_fields(path: str | Path) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Collection, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 from pbl_pipeline.bounded import npz_fields, read_npz
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.names import is_plain
+from pbl_pipeline.temporary import new_folder
 
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
@@ -34,6 +36,25 @@ def sha256_of(path: str | Path) -> str:
     """SHA-256 of a file as 64 hex digits, computed in pieces. Raises OSError."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sha256_packed(path: Path, pack: Callable[[Path, Path], Path]) -> str:
+    """SHA-256 of a file, or of a folder's copy that `pack` writes."""
+    if path.is_file():
+        return sha256_of(path)
+    with new_folder() as folder:
+        return sha256_of(pack(path, folder / "copy.zip"))
+
+
+def zipped(folder: Path, copy: Path, names: Iterable[str], how: int = zipfile.ZIP_STORED) -> Path:
+    """Write files of a folder as a zip whose bytes depend on their names and contents only (packed: also on zlib)."""
+    with zipfile.ZipFile(copy, "w") as archive:
+        for name in sorted(names):
+            member = zipfile.ZipInfo(name)
+            member.compress_type = how
+            with (folder / name).open("rb") as source, archive.open(member, "w") as target:
+                shutil.copyfileobj(source, target)
+    return copy
 
 
 def load_npz(

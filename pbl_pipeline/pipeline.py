@@ -14,7 +14,7 @@ import numpy as np
 
 from pbl_pipeline import progress
 from pbl_pipeline.deidentify import to_show
-from pbl_pipeline.depth import at_points, read_depth
+from pbl_pipeline.depth import DepthFile, PointDepths, at_points, read_depth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import METHODS as FIT_METHODS
@@ -56,8 +56,7 @@ def run_visit(
     mass_kg: float | None = None,
     activity: str | None = None,
     sensors: Sequence[SensorLog] = (),
-    depth_files: Sequence[Path | None] = (),
-    depth_scale_m: float | None = None,
+    depth_files: Sequence[DepthFile | None] = (),
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -69,8 +68,7 @@ def run_visit(
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`;
     `mass_kg`: as in `visit_kinetics`. `activity`: what the person does in the videos; None: unknown, which counts
     as walking. `sensors`: logs of the wearable sensors of the visit, as `read_given` returns them. `depth_files`: of
-    each video, None where there is none; one that does not belong to its video leaves that out; `depth_scale_m`: as in
-    `read_depth`.
+    each video, None where there is none; one that does not belong to its video leaves that out.
 
     Raises the error of the video where no video of the visit can be fitted: the VIDEO_ codes,
     TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes, CAMERA_INVALID, MODEL_
@@ -92,7 +90,7 @@ def run_visit(
     depths = depth_files or [None] * len(paths)
     for path, name, log, depth in zip(paths, distinct_names(paths), logs, depths, strict=True):
         one = _Input(path, name, log, out, camera_file, person, people.paramset, keypoints.paramset, method.paramset)
-        one = dataclasses.replace(one, depth=depth, depth_scale_m=depth_scale_m)
+        one = dataclasses.replace(one, depth=depth)
         try:
             first = seen.setdefault(sha256_of(check_file(path)), name)
             if first != name:
@@ -101,7 +99,7 @@ def run_visit(
             one = dataclasses.replace(one, error=error)
         inputs.append(one)
     found: list[Recording] = []
-    depths = list[np.ndarray | None]()
+    depths = list[PointDepths | None]()
     for one, (recording, error, depth) in zip(inputs, _side_by_side(inputs), strict=True):
         found.append(dataclasses.replace(recording, condition=condition))
         depths += [] if recording.problem else [depth]
@@ -146,12 +144,11 @@ class _Input:
     keypoints: Paramset
     fit: Paramset
     error: PblError | None = None
-    depth: Path | None = None
-    depth_scale_m: float | None = None
+    depth: DepthFile | None = None
 
 
 #: Keypoints of a video with the error that leaves it out, and the depths at them.
-_Output = tuple[Recording, PblError | None, np.ndarray | None]
+_Output = tuple[Recording, PblError | None, PointDepths | None]
 
 
 def _side_by_side(inputs: Sequence[_Input]) -> Iterator[_Output]:
@@ -170,7 +167,7 @@ def _side_by_side(inputs: Sequence[_Input]) -> Iterator[_Output]:
 @frames_kept()
 def _detected(one: _Input) -> _Output:
     """Keypoints of a video, checked, with the depths at them, or the error that leaves it out."""
-    video = choice = depth = None
+    video = choice = recorded = None
     try:
         if one.error is not None:
             raise one.error
@@ -178,8 +175,8 @@ def _detected(one: _Input) -> _Output:
         camera = find_camera(video, one.camera_file)
         if one.depth is not None:
             size = video.width_px, video.height_px
-            depth = read_depth(one.depth, np.asarray(video.time_s), size, one.depth_scale_m)
-            camera = depth.camera(camera)
+            recorded = read_depth(one.depth.file, np.asarray(video.time_s), size, one.depth.scale_m)
+            camera = recorded.camera(camera)
         tracking = track_people(one.path, one.people, info=video)
         choice = choose_subject(tracking, override=one.person)
         subject = require_subject(choice, tracking, one.path, one.out / f"{one.name}.persons.png")
@@ -187,7 +184,7 @@ def _detected(one: _Input) -> _Output:
         if one.log is not None:
             points = points.with_attitude(attitude_of(one.log[1], one.log[0], video))
         check_trial(points, one.name, one.fit)
-        depths = None if depth is None else at_points(depth, points)
+        depths = None if recorded is None else at_points(recorded, points)
         return Recording.of(one.name, keypoints=points, path=one.path, video=video, choice=choice), None, depths
     except PblError as error:
         problem = choice.reason if choice is not None and choice.person_id is None else error.short()

@@ -14,7 +14,6 @@ from .options import (
     CAMERA_MOTION_HELP,
     CAMERA_MOTIONS,
     DEPTH,
-    DEPTH_SCALE,
     HEIGHT,
     IMU,
     depth_files,
@@ -47,7 +46,6 @@ _ENDS = (".npz", ".keypoints", ".markers", ".csv", ".h5", ".hdf5", ".dlc", ".ana
 @HEIGHT
 @IMU
 @DEPTH
-@DEPTH_SCALE
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
 )
@@ -68,7 +66,6 @@ def fit(
     height_m: float | None,
     imu: tuple[str, ...],
     depth: tuple[str, ...],
-    depth_scale: float | None,
     up: str,
 ) -> None:
     """Fit one body to FILES, the trials of one session.
@@ -81,6 +78,7 @@ def fit(
     """
     import numpy as np
 
+    from pbl_pipeline.depth import with_recordings
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import fit_session, points_of
     from pbl_pipeline.keypoints import WorldMarkers
@@ -91,11 +89,11 @@ def fit(
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
     if cameras and depth:
         raise PblError("USAGE", "--depth with --cameras", "keypoints of one camera", "leave out --depth")
-    sensors, recordings_of_depth = sensor_logs(imu), depth_files(depth, len(files), depth_scale)
+    sensors, recordings_of_depth = sensor_logs(imu), depth_files(depth, len(files))
     table = _marker_set(marker_set)
     facts = _facts(len(files), video, fps, width, height, camera, person)
     trials: Sequence[Any] = [_load(path, table, up, f) for path, f in zip(files, facts, strict=True)]
-    trials, depths = _with_depths(trials, recordings_of_depth, depth_scale)
+    trials, depths = with_recordings(trials, recordings_of_depth)
     paramset = fit_paramset(solver, params, points_of(trials))
     stems = [_stem(path) for path in files]
     if cameras:
@@ -107,7 +105,7 @@ def fit(
     more: dict[str, Any] = {} if table is None else {"markers": table}
     if sensors:
         more |= {"sensors": sensors, "sensor_clock_s": [None] * len(trials)}
-    if depths:
+    if any(depths):
         more |= {"depths": depths}
     motion = motions[0] if len(set(motions)) == 1 else motions
     session = fit_session(trials, names, paramset, motion, height_m=height_m, **more)
@@ -185,27 +183,6 @@ def _load(path: Path, table: MarkerSet | None, up: str, facts: RecordingFacts) -
         if names:
             click.echo(f"{what}: {', '.join(names)}")
     return found.trial
-
-
-def _with_depths(
-    trials: Sequence[Any], files: Sequence[Path | None], scale_m: float | None
-) -> tuple[list[Any], list[Any]]:
-    """Return the trials with the cameras of their depth recordings, and the depths at the keypoints of each."""
-    import dataclasses
-
-    from pbl_pipeline.depth import at_points, read_depth
-    from pbl_pipeline.keypoints import Keypoints
-
-    if all(file is None for file in files):
-        return list(trials), []
-    found, depths = [], []
-    for trial, file in zip(trials, files, strict=True):
-        if file is not None and not isinstance(trial, Keypoints):
-            raise PblError("USAGE", "--depth with markers", "keypoints of a video", "leave out --depth")
-        depth = None if file is None else read_depth(file, trial.time_s, trial.image_size_px, scale_m)
-        found.append(trial if depth is None else dataclasses.replace(trial, camera=depth.camera(trial.camera)))
-        depths.append(None if depth is None else at_points(depth, trial))
-    return found, depths
 
 
 def _views_of_one(

@@ -15,6 +15,7 @@ from pbl_pipeline.names import whole_number
 from pbl_pipeline.texts import LANGUAGES
 
 if TYPE_CHECKING:
+    from pbl_pipeline.depth import DepthFile
     from pbl_pipeline.fit import Params, Points
     from pbl_pipeline.keypoints import KeypointParams
     from pbl_pipeline.methods import Method
@@ -41,11 +42,9 @@ IMU = click.option(
 DEPTH = click.option(
     "--depth",
     multiple=True,
-    metavar="FILE_OR_FOLDER",
-    help="Depth recording of a video (docs/depth.md), once for each, in their order; 'none' for one without.",
-)
-DEPTH_SCALE = click.option(
-    "--depth-scale", type=float, help="Metres of one step of the 16-bit pictures of --depth, such as 0.001."
+    metavar="[SCALE=]FILE",
+    help="Depth recording of a video (docs/depth.md), once for each, in their order, 'none' for one without; 16-bit "
+    "pictures as 0.001=FOLDER, with the metres of one step.",
 )
 COMPARE = click.option(
     "--compare",
@@ -81,10 +80,10 @@ def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     return logs
 
 
-def depth_files(given: Sequence[str], n: int, scale_m: float | None) -> list[Path | None]:
-    """Paths of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them, or a scale alone."""
-    if scale_m is not None and not given:
-        raise PblError("USAGE", "--depth-scale alone", "--depth with it", "name the folder of the depth pictures")
+def depth_files(given: Sequence[str], n: int) -> list[DepthFile | None]:
+    """Recordings of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them."""
+    from pbl_pipeline.depth import DepthFile
+
     if given and len(given) != n:
         raise PblError(
             "USAGE",
@@ -92,7 +91,7 @@ def depth_files(given: Sequence[str], n: int, scale_m: float | None) -> list[Pat
             expected="none, or one for each video, in the same order",
             next_step="name a recording for each video, 'none' for one without",
         )
-    return [None if path == "none" else Path(path) for path in given] or [None] * n
+    return [None if text == "none" else DepthFile.of(text) for text in given] or [None] * n
 
 
 def show_changes(visit: Visit, before: Visit, metrics: Path) -> None:

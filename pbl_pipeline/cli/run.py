@@ -13,7 +13,6 @@ from .options import (
     CAMERA_MOTIONS,
     COMPARE,
     DEPTH,
-    DEPTH_SCALE,
     DEVICE,
     HEIGHT,
     IMU,
@@ -43,7 +42,6 @@ from .options import (
 )
 @IMU
 @DEPTH
-@DEPTH_SCALE
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option(
     "--person",
@@ -71,7 +69,6 @@ def run(
     attitude: tuple[Path, ...],
     imu: tuple[str, ...],
     depth: tuple[str, ...],
-    depth_scale: float | None,
     camera_motion: str | None,
     person: int | None,
     people: str | None,
@@ -120,7 +117,7 @@ def run(
 
     before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
-    sensors, depths = sensor_logs(imu), depth_files(depth, len(videos), depth_scale)
+    sensors, depths = sensor_logs(imu), depth_files(depth, len(videos))
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
@@ -139,7 +136,6 @@ def run(
         activity,
         sensors,
         depths,
-        depth_scale,
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

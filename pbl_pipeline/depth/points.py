@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float
 
@@ -15,8 +17,17 @@ from .recording import FARTHEST_M, Depth, Pictures
 _SPREAD_M, _LEAST, _CONFIDENT, _NEAR = 0.05, 5, 1, 0.75
 
 
-def at_points(depth: Depth, keypoints: Keypoints) -> Float[np.ndarray, "T J 2"]:
-    """Depths (m) along the camera's axis at each keypoint: the median of 3 x 3 pixels if most of them show one surface;
+@dataclasses.dataclass(frozen=True)
+class PointDepths:
+    """Depths at the keypoints of a trial, with the name and the SHA-256 of their recording."""
+
+    m: Float[np.ndarray, "T J 2"]  # of `at_points`
+    name: str = ""
+    sha256: str = ""
+
+
+def at_points(depth: Depth, keypoints: Keypoints) -> PointDepths:
+    """Depths along the camera's axis at each keypoint: the median of 3 x 3 pixels if most of them show one surface;
     and of the nearest surface in 5 x 5, since a point beside a thin limb shows the wall.
 
     NaN where none is known, of low confidence, farther than `FARTHEST_M`, and where no picture is near in time. Raises
@@ -36,7 +47,7 @@ def at_points(depth: Depth, keypoints: Keypoints) -> Float[np.ndarray, "T J 2"]:
         middle = _middle(around)
         alike = np.sum(np.abs(around - middle[:, None]) <= _SPREAD_M / 2, axis=1) >= _LEAST
         out[t, known[t]] = np.stack([np.where(alike, middle, np.nan), _foremost(_around(pictures, at, 2))], axis=-1)
-    return out
+    return PointDepths(out, depth.path.name, depth.sha256)
 
 
 def _around(pictures: Pictures, at: np.ndarray, reach: int) -> np.ndarray:

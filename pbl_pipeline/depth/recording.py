@@ -23,6 +23,8 @@ _LOOKED_AT, _MOST_FAR, _SHAPE, _FEWER, _FOCAL, _LONGER, _MIDDLE = 5, 0.9, 0.03, 
 #: Standard deviation of a focal length that the recording states, as a fraction.
 _FOCAL_REL_SD = 0.01
 
+_TURN = "turn the video, or depth pictures that do not state how the phone was held, so that the person is upright"
+
 #: Depths and confidences of a frame.
 Pictures = tuple[np.ndarray, np.ndarray | None]
 
@@ -35,7 +37,8 @@ depth_error = functools.partial(
 class Depth:
     """A depth recording. `time_s` (N,): of its frames, 0 is the first; `size_px`: width and height of the video's
     pictures; `matrix` (3, 3) px: of those, `own_matrix`: of the depth pictures, None where the file does not state it
-    and both show the same; `read`: raw depths (m, H x W) and confidences (H x W, 0 to 2, or None) of some frames."""
+    and both show the same; `read`: raw depths (m, H x W) and confidences (H x W, 0 to 2, or None) of some frames;
+    `sha256`: of its file, or of a folder's zip."""
 
     path: Path
     time_s: np.ndarray
@@ -43,6 +46,7 @@ class Depth:
     matrix: np.ndarray | None
     own_matrix: np.ndarray | None
     read: Callable[[Iterable[int]], Iterator[Pictures]]
+    sha256: str = ""
 
     def camera(self, found: Camera) -> Camera:
         """The video's camera: that of the recording, unless the one that was found is calibrated or it states none.
@@ -129,17 +133,6 @@ def checked(depth: Depth, time_s: np.ndarray) -> Depth:
 def _check_picture(depth: Depth, height: int, width: int) -> None:
     """The shape of the pictures, and the middle of the lens, must be those of the video's camera."""
     w, h = depth.size_px
-    matrices = ((depth.matrix, depth.size_px), (depth.own_matrix, (width, height)))
-    for matrix, size in matrices:
-        if matrix is None:
-            continue
-        away = np.abs(matrix[:2, 2] / size - 0.5)
-        if not (np.isfinite(matrix).all() and np.all(np.diag(matrix) > 0) and np.all(away < _MIDDLE)):
-            raise depth_error(
-                said("a camera matrix with its middle at {x:.0f}, {y:.0f} px", x=matrix[0, 2], y=matrix[1, 2]),
-                said("that of pictures of {w}x{h}", w=size[0], h=size[1]),
-                key=depth.path,
-            )
     shape = (width / height) / (w / h)
     if depth.own_matrix is None and abs(shape - 1) > _SHAPE:
         turned = abs(width / height * w / h - 1) <= _SHAPE
@@ -154,4 +147,16 @@ def _check_picture(depth: Depth, height: int, width: int) -> None:
             ),
             "pictures of one camera, upright as the video is shown",
             key=depth.path,
+            **({"next_step": _TURN} if turned else {}),
         )
+    matrices = ((depth.matrix, depth.size_px), (depth.own_matrix, (width, height)))
+    for matrix, size in matrices:
+        if matrix is None:
+            continue
+        away = np.abs(matrix[:2, 2] / size - 0.5)
+        if not (np.isfinite(matrix).all() and np.all(np.diag(matrix) > 0) and np.all(away < _MIDDLE)):
+            raise depth_error(
+                said("a camera matrix with its middle at {x:.0f}, {y:.0f} px", x=matrix[0, 2], y=matrix[1, 2]),
+                said("that of pictures of {w}x{h}", w=size[0], h=size[1]),
+                key=depth.path,
+            )

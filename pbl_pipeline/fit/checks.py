@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
-from pbl_pipeline.results import SensorFit
+from pbl_pipeline.results import DepthFit, SensorFit
 
 from .augmented_pelvis import folds
-from .depths import DepthFit
 from .initial_pose import pelvis_path
 from .problem import CLOCK_RANGE_S
 from .results import SD_WARN_DEG, TrialFit
@@ -79,7 +78,7 @@ def check_fit(
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
     checks += _sensors([sensor for trial in trials for sensor in trial.sensors])
-    checks += _depths(solution.depth)
+    checks += _depths([found for found in solution.depths if found is not None])
     # Only a check that did not pass has advice.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
@@ -159,12 +158,12 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
     ]
 
 
-def _depths(found: DepthFit | None) -> list[Check]:
+def _depths(found: Sequence[DepthFit]) -> list[Check]:
     """Checks of the depths; empty if there are none."""
-    if found is None:
+    if not found:
         return []
-    used, fits, z = float(np.nanmin(found.used)), float(np.nanmin(found.fits)), float(np.nanmax(found.z))
-    ratio = found.distance
+    used, ratio = min(d.used for d in found), found[0].distance
+    fits, z = float(np.nanmin([d.fits for d in found])), float(np.nanmax([d.z for d in found]))
     return [
         Check(
             "depth_distance_ratio",

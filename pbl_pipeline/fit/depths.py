@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pbl_pipeline.body import capsules, ray_lengths, scale_multipliers
+from pbl_pipeline.depth.points import PointDepths
 from pbl_pipeline.depth.recording import depth_error
 from pbl_pipeline.errors import said
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.results import DepthFit
 
 from .problem import Depths, Problem, State, Surface
 from .session import Session
@@ -33,36 +35,16 @@ FLOOR_SHARES = {"hip_flexion": 0.75, "knee_angle": 0.75}
 FLOOR_LEAST_USED = 0.3
 
 
-@dataclasses.dataclass(frozen=True)
-class DepthFit:
-    """The depths of N trials, as a fit found them.
-
-    `used` (N,): share of the used frames' large joints with a depth that was used, NaN without a recording; `fits`
-    (N,): share of the depths of joints in sight that lie where the person is; `after` (N,): distance of the fit over
-    theirs; `z` (N,): root mean square of their error in standard deviations; `distance`: that of the fit without depths
-    over theirs, of all trials; `metre`: metres of the fit in one of theirs.
-    """
-
-    used: np.ndarray
-    fits: np.ndarray
-    after: np.ndarray
-    z: np.ndarray
-    distance: float
-    metre: float
-
-
-def check_depths(
-    depths: Sequence[np.ndarray | None], trials: Sequence[Any]
-) -> tuple[Float[np.ndarray, "T J 2"] | None, ...]:
+def check_depths(depths: Sequence[PointDepths | None], trials: Sequence[Any]) -> tuple[PointDepths | None, ...]:
     """The depths of some trials; empty where there are none. Raises `PblError` DEPTH_FILE: they are of other trials, of
     several cameras, or none is known."""
     if all(d is None for d in depths):
         return ()
-    shapes = [None if d is None else np.shape(d) for d in depths]
+    shapes = [None if d is None else np.shape(d.m) for d in depths]
     wanted = [(*np.shape(t.confidence), 2) if isinstance(t, Keypoints) else None for t in trials]
     if len(shapes) != len(wanted) or any(s not in (None, w) for s, w in zip(shapes, wanted, strict=True)):
         raise depth_error(f"depths of shapes {shapes}", f"those of keypoints of one camera: {wanted}")
-    if not any(d is not None and np.isfinite(d).any() for d in depths):
+    if not any(d is not None and np.isfinite(d.m).any() for d in depths):
         raise depth_error("no depth at any keypoint", "a person within reach of the depth camera")
     return tuple(depths)
 
@@ -90,7 +72,7 @@ def with_depths(
         body = capsules(session.body, np.asarray(start.qpos, float)[rows], scale)
         first = ray_lengths(body, arrays.p_nc[arrays.used, 0], ray).min(axis=-1)
         skin[at] = np.where(np.isfinite(first), first - 1, -1) * z[at]
-        depths[at] = own[arrays.used][:, columns]
+        depths[at] = own.m[arrays.used][:, columns]
         seen[at] = (arrays.c_2d[arrays.used, 0][:, columns] > 0) & (skin[at] > SKIN_M[0]) & (skin[at] < SKIN_M[1])
     depths[~seen] = np.nan
     ratio = (z + skin)[..., None] / depths
@@ -141,8 +123,8 @@ def shares_of_floors(session: Session, p: Problem) -> Float[np.ndarray, "F Q"]:
 
 def depth_fit(
     session: Session, p: Problem, start: State, end: State, x: Float[Array, "F J 3"], share: np.ndarray, sd_m: float
-) -> DepthFit:
-    """The depths as a solution with markers at `x` finds them."""
+) -> tuple[DepthFit | None, ...]:
+    """The depths of each trial as a solution with markers at `x` finds them."""
     seen, surface = p.depths, end.surface
     assert seen is not None
     assert surface is not None
@@ -152,14 +134,10 @@ def depth_fit(
     z = np.einsum("fji,fi->fj", np.asarray(x, float) - np.asarray(p.p_nc, float), R)
     skin = np.asarray(seen.skin_m, float) + np.asarray(surface.offset_m, float)
     error = (z + skin - metre * depth) / sd_m
-    rows, joints = list[tuple[float, ...]](), np.count_nonzero(_large(session))
-    for i, arrays in enumerate(session.arrays):
-        at = session.frames(i)
-        n, e = count[at], error[at][count[at]]
-        if not n.any():
-            rows.append((np.nan if session.depths[i] is None else 0.0, share[i], np.nan, np.nan))
-            continue
-        after = float(np.median((z + skin)[at][n] / (metre * depth[at][n])))
-        rows.append((n.sum() / (arrays.used.sum() * joints), share[i], after, np.sqrt(np.mean(e**2))))
+    found, joints = list[DepthFit | None](), np.count_nonzero(_large(session))
     distance = float(start.surface.metre) / session.metre
-    return DepthFit(*np.array(rows, float).T, distance=distance, metre=metre)
+    for i, (arrays, own) in enumerate(zip(session.arrays, session.depths, strict=True)):
+        e = error[session.frames(i)][count[session.frames(i)]]
+        used, rms = len(e) / (arrays.used.sum() * joints), float(np.sqrt(np.mean(e**2))) if len(e) else np.nan
+        found.append(own and DepthFit(own.name, own.sha256, float(used), float(share[i]), rms, distance, metre))
+    return tuple(found)

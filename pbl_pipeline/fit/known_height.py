@@ -25,9 +25,10 @@ def in_metres(session: Session, solution: Solution, height_m: float | None) -> t
 
     Lengths that several cameras, a depth camera or laboratory markers measured do not change.
     """
-    factor = 1.0 / (session.metre if solution.depth is None else solution.depth.metre)
+    depths = next(filter(None, solution.depths), None)
+    factor = 1.0 / (session.metre if depths is None else depths.metre)
     taller = None if height_m is None else height_m / (factor * stature_m(session.body, solution.scale))
-    guessed = solution.depth is None and all(isinstance(t, Keypoints) for t in session.trials)
+    guessed = depths is None and all(isinstance(t, Keypoints) for t in session.trials)
     if taller is not None and guessed:
         factor *= taller
     return solution if factor == 1.0 else _enlarged(session, solution, factor), taller

@@ -153,8 +153,8 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
         solution = dataclasses.replace(solution, sensors=sensors)
     if session.depths:
         x = solution.outcome.x_world_m
-        depth = depths.depth_fit(session, p, start, found.end.state, x, in_place, params.depth_point_sd_m)
-        solution = dataclasses.replace(solution, depth=depth)
+        of_trials = depths.depth_fit(session, p, start, found.end.state, x, in_place, params.depth_point_sd_m)
+        solution = dataclasses.replace(solution, depths=of_trials)
     return solution
 
 

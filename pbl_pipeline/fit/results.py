@@ -15,10 +15,8 @@ from pbl_pipeline.errors import PblError, unread_file
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import from_json, plain, record
-from pbl_pipeline.results import SensorFit, Solution
+from pbl_pipeline.results import DepthFit, SensorFit, Solution
 from pbl_pipeline.video import Camera, check_lens
-
-from .depths import DepthFit
 
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
 SD_WARN_DEG = 20.0
@@ -38,7 +36,8 @@ class TrialFit:
     estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
     the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
     keypoints, which tells their detector, "" if they have none or the file is from before it was kept. sensors: what
-    was found of each wearable sensor. with_depths: depth recordings set the scale.
+    was found of each wearable sensor, depth: of the trial's depth recording, if it has one. with_depths: depth
+    recordings set the scale, this trial's or another's.
     """
 
     name: str
@@ -69,6 +68,7 @@ class TrialFit:
     confidence_curve: str = ""
     sensors: tuple[SensorFit, ...] = ()
     with_depths: bool = False
+    depth: DepthFit | None = None
 
     @property
     def sized(self) -> bool:
@@ -93,6 +93,8 @@ class TrialFit:
         arrays = {k: np.asarray(getattr(self, k)) for k in _ARRAYS}
         if self.sensors:
             arrays["sensors"] = np.asarray(json.dumps(plain(self.sensors)))
+        if self.depth is not None:
+            arrays["depth"] = np.asarray(json.dumps(plain(self.depth)))
         arrays["camera_matrix"] = np.asarray(self.camera.matrix)
         arrays["distortion"] = np.asarray(self.camera.distortion)
         arrays["camera_source"] = np.asarray(self.camera.source)
@@ -102,13 +104,14 @@ class TrialFit:
     def load(cls, path: str | Path) -> TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
         fields = [*_ARRAYS, "camera_matrix", "distortion", "camera_source"]
-        # Older files lack what could not be stated or was not kept then, others have no sensors.
+        # Older files lack what could not be stated or was not kept then, others have no sensors or depths.
         data = {
             "height_m": np.asarray(np.nan),
             "confidence_curve": np.asarray(""),
             "with_depths": np.asarray(False),
             "sensors": np.asarray("[]"),
-            **load_npz(path, [*fields, "sensors"]),
+            "depth": np.asarray("null"),
+            **load_npz(path, [*fields, "sensors", "depth"]),
         }
         missing = [k for k in fields if k not in data]
         if missing:
@@ -122,6 +125,8 @@ class TrialFit:
         values = {k: data[k] for k in _ARRAYS}
         try:
             values["sensors"] = tuple(from_json(SensorFit, s) for s in parse_json(text_of(path, data, "sensors")))
+            depth = parse_json(text_of(path, data, "depth"))
+            values["depth"] = None if depth is None else from_json(DepthFit, depth)
         except (ValueError, TypeError, AttributeError) as error:
             raise unread_file(
                 error, "a file that `pbl fit` wrote", "see docs/files.md, section fit.npz", path
@@ -149,11 +154,10 @@ class SessionFit(Solution):
     trials: tuple[TrialFit, ...]
     site_offset_m: np.ndarray
     qc: tuple[Check, ...]
-    depth: DepthFit | None = None
 
 
 #: Fields of a trial that its file has as they are.
-_ARRAYS = [f.name for f in dataclasses.fields(TrialFit) if f.name not in ("camera", "sensors")]
+_ARRAYS = [f.name for f in dataclasses.fields(TrialFit) if f.name not in ("camera", "sensors", "depth")]
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import MARKER_SETS, Body, MarkerSet, load_body, marker_set
+from pbl_pipeline.depth.points import PointDepths
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.keypoints import (
     SEEN_SHARE,
@@ -61,7 +62,7 @@ class Session:
     metre: float = 1.0
     turned: tuple[Turned, ...] = ()  # trials whose vertical was wrong (`world_checks`)
     worn: Worn | None = None
-    depths: tuple[np.ndarray | None, ...] = ()  # of each trial (T, J, 2), `at_points`; empty without any
+    depths: tuple[PointDepths | None, ...] = ()  # of each trial; empty without any
 
     @property
     def plain(self) -> bool:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from pbl_pipeline.body import MarkerSet, load_body
+from pbl_pipeline.depth.points import PointDepths
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
@@ -53,7 +54,7 @@ class SessionInput:
     height_m: float | None = None
     sensors: Sequence[SensorLog] = ()
     sensor_clock_s: Sequence[Stated] | None = None
-    depths: Sequence[np.ndarray | None] = ()
+    depths: Sequence[PointDepths | None] = ()
 
 
 def fit_session(
@@ -65,7 +66,7 @@ def fit_session(
     height_m: float | None = None,
     sensors: Sequence[SensorLog] = (),
     sensor_clock_s: Sequence[Stated] | None = None,
-    depths: Sequence[np.ndarray | None] = (),
+    depths: Sequence[PointDepths | None] = (),
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
@@ -97,7 +98,7 @@ def fit_session(
         clocks (`sensors.places`); None where it is not known, so that it is looked for in the whole log. Default: one
         trial, in which both begin together; not known of several.
     depths
-        Of each trial of one camera, (T, J, 2) in m at its keypoints (`depth.at_points`), or None.
+        Of each trial of one camera, at its keypoints (`depth.with_recordings`), or None.
     """
     given = SessionInput(trials, names, camera_motion, markers, height_m, sensors, sensor_clock_s, depths)
     result = fit_sessions([given], paramset)[0]
@@ -195,7 +196,6 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution, taller),
-        depth=solution.depth,
     )
 
 
@@ -246,7 +246,8 @@ def _trial_fit(
         height_m=float("nan") if height_m is None else height_m,
         confidence_curve=view.confidence_curve if isinstance(view, Keypoints) else "",
         sensors=solution.sensors[i] if solution.sensors else (),
-        with_depths=solution.depth is not None,
+        with_depths=bool(solution.depths),
+        depth=solution.depths[i] if solution.depths else None,
     )
 
 

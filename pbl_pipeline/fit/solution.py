@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pbl_pipeline.results import SensorFit
+from pbl_pipeline.results import DepthFit, SensorFit
 
-from .depths import DepthFit
 from .keypoint_terms import in_camera, mean_weights, offset_m, residual_2d_px, residual_3d_cm
 from .problem import Problem
 from .solvers.result import Result
@@ -42,7 +41,7 @@ class Solution:
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
     deviations, None if the solver computes none; pelvis_told: 1 in frames with the augmenter's tilt of the pelvis, None
     if the method does not use it; metre: metres of the solution in one of the fit; sensors: what was found of those
-    worn, in each trial, and depth of the depths; result: reason why the solver ended.
+    worn, in each trial, and depths of its depths, empty without any; result: reason why the solver ended.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -61,7 +60,7 @@ class Solution:
     pelvis_told: Float[np.ndarray, " F"] | None = None
     metre: float = 1.0
     sensors: tuple[tuple[SensorFit, ...], ...] = ()
-    depth: DepthFit | None = None
+    depths: tuple[DepthFit | None, ...] = ()
 
     @property
     def converged(self) -> bool:

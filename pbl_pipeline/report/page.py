@@ -371,6 +371,9 @@ def _recording_origin(r: Recording) -> list[tuple[str, str, bool]]:
     camera = r.fit.camera if r.fit is not None else r.keypoints.camera if r.keypoints is not None else None
     if camera is not None and np.isfinite(camera.matrix).all():
         rows.append(("Camera", f"{camera.source}; focal length {camera.matrix[0, 0]:.0f} px", False))
+    if r.fit is not None and r.fit.depth is not None:
+        rows.append(("Depth recording", r.fit.depth.name, False))
+        rows.append(("Depth recording (SHA-256)", r.fit.depth.sha256, True))
     if v is not None:
         rows += [("Remark", note, False) for note in v.notes]
     if m is not None:

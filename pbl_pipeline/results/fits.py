@@ -54,6 +54,19 @@ class Residuals:
 
 
 @record
+class DepthFit:
+    """Results of a fit for the depth recording of one trial."""
+
+    name: str = column("depths_name", "name of the recording", "varchar(255)")
+    sha256: str = column("depths_sha256", "of its bytes, of a folder those of its zip", "char(64)")
+    used: float = column("depths_used", "(-) share of the used frames' large joints with a depth that was used")
+    fits: float = column("depths_fits", "(-) share of the depths of joints in sight that lie on the person", null=True)
+    z: float = column("depths_z", "(-) their error in standard deviations, root mean square", null=True)
+    distance: float = column("depths_distance", "(-) distance of the fit without depths over theirs, of the visit")
+    metre: float = column("depths_metre", "(-) metres of the fit in one of theirs, by which it is divided, of a visit")
+
+
+@record
 class SensorFit:
     """Results of a fit for a sensor in one trial; NaN where it was not measured or not stated."""
 

@@ -85,6 +85,7 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
         "orientation_source": {n: f.orientation_source for n, f in fits.items()},
         "phone_clock_offset_s": {n: plain(round(f.phone_clock_offset_s, 4)) for n, f in fits.items()},
         "sensors": {n: plain(f.sensors, 6) for n, f in fits.items() if f.sensors},
+        "depths": {n: plain(f.depth, 6) for n, f in fits.items() if f.depth is not None},
         "height_m": next((plain(round(f.height_m, 4)) for f in fits.values()), None),
         "qc": plain(visit.fit_checks),
     }

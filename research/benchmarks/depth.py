@@ -70,7 +70,8 @@ def walks(view: str, seed: int, params: str) -> dict[str, Walk]:
         error, within = errors(fit, made.truth)
         path = pelvis_path(load_body(), np.asarray(fit.trials[0].qpos, float))[0]
         ratio = np.linalg.norm(path, axis=1) / np.linalg.norm(made.truth.pelvis_m, axis=1)
-        used, z = (np.nan, np.nan) if fit.depth is None else (float(fit.depth.used[0]), float(fit.depth.z[0]))
+        found = fit.trials[0].depth
+        used, z = (np.nan, np.nan) if found is None else (found.used, found.z)
         out[name] = Walk(error, within, float(np.nanmedian(ratio)), used, z, seconds)
     return out
 

@@ -16,7 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.fits import Residuals, SensorFit, Solution
+from pbl_pipeline.results.fits import DepthFit, Residuals, SensorFit, Solution
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
@@ -95,6 +95,7 @@ class SessionFit(dj.Computed):
     Sensor = part_of(
         "Sensor", SensorFit, comment="what was found of a wearable sensor in a trial", of=("master", "FitSet.Video")
     )
+    Depth = part_of("Depth", DepthFit, comment="what was found of a depth recording", of=("master", "FitSet.Video"))
 
     @property
     def key_source(self) -> Any:
@@ -115,21 +116,22 @@ class SessionFit(dj.Computed):
         files = {r["video_id"]: file_ref(r["keypoints_file" if rows else "markers_file"]) for r in rows or of_markers}
         leads = [r for r in rows or of_markers if not of_rig or views[int(r["video_id"])]]
         names = distinct([Path(r["video_name"]).stem for r in leads], [r["video_id"] for r in leads])
-        trials = []
+        now, trials = _beside(key), []
+        depths = _depths(now[1])
         for r, name in zip(leads, names, strict=True):
             own = views.get(int(r["video_id"]), [])
             if not all(v["video_id"] in files for v in own):
                 raise InputChanged("a camera of this set has no keypoints any more")
             refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
-            trials.append((r["video_id"], name, r["camera_motion"], refs, rig_of(own)))
+            trials.append((r["video_id"], name, r["camera_motion"], refs, rig_of(own), depths.get(r["video_id"])))
         height_m = number(one(_people(FitSet) & key, "subject_height"))
         table = None
         if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
             table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
         worn = None
-        if rows and (now := _sensors_now(key)):
-            worn = (*_worn(int(one(FitSet & key, "session_id")), {int(t[0]): t[1] for t in trials}), now)
-        return trials, table, height_m, worn, method_row(FitMethod, key)
+        if now[0]:
+            worn = _worn(int(one(FitSet & key, "session_id")), {int(t[0]): t[1] for t in trials})
+        return trials, table, height_m, worn, now, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -139,6 +141,7 @@ class SessionFit(dj.Computed):
         table: tuple | None,
         height_m: float | None,
         worn: tuple | None,
+        beside: tuple,
         method: Mapping[str, Any],
     ) -> tuple[lib.SessionFit, list[int], str, tuple]:
         from pbl_pipeline.fit import fit_session
@@ -147,6 +150,8 @@ class SessionFit(dj.Computed):
         stated = {"markers": session_input.markers, "height_m": height_m}
         if worn is not None:
             stated |= {"sensors": session_input.sensors, "sensor_clock_s": session_input.sensor_clock_s}
+        if session_input.depths:
+            stated |= {"depths": session_input.depths}
         result = fit_session(
             session_input.trials,
             session_input.names,
@@ -154,7 +159,7 @@ class SessionFit(dj.Computed):
             camera_motion=session_input.camera_motion,
             **{k: v for k, v in stated.items() if v is not None},
         )
-        return result, [t[0] for t in trials], method["sha"], worn[2] if worn else ()
+        return result, [t[0] for t in trials], method["sha"], beside
 
     def make_computes(
         self, keys: Sequence[dict], fetched: Sequence[tuple], threads: int | None = None
@@ -181,41 +186,44 @@ class SessionFit(dj.Computed):
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):
-                    worn = fetched[i][3]
-                    out[i] = (result, [t[0] for t in fetched[i][0]], sha, worn[2] if worn else (), origin)
+                    out[i] = (result, [t[0] for t in fetched[i][0]], sha, fetched[i][4], origin)
         return out
 
     def _loaded(
         self, trials: Sequence[tuple], table: tuple | None, height_m: float | None, worn: tuple | None
     ) -> lib.SessionInput:
-        """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`, and
-        the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
+        """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`,
+        their depths, and the logs of wearable sensors. Raises `PblError` SENSOR_LOG, DEPTH_FILE."""
         from pbl_pipeline.body import load_marker_set
+        from pbl_pipeline.depth import DepthFile, with_recordings
         from pbl_pipeline.fit import SessionInput
         from pbl_pipeline.sensors import places
 
-        _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
-        own, more = None, {}
+        _, names, motions, refs, rigs, files = (list(column) for column in zip(*trials, strict=True))
+        own, more = None, dict[str, Any]()
         with ExitStack() as stack:
             markers = video.NO_CAMERA in motions
             loaded = [load_input(stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
             if worn is not None:
-                logs, recorded = _read_worn(*worn[:2])[0], [worn[1].get(name) for name in names]
+                logs, recorded = _read_worn(*worn)[0], [worn[1].get(name) for name in names]
                 more = {"sensors": logs, "sensor_clock_s": places(logs, recorded, loaded)}
+            if any(files):
+                given = [f and DepthFile(stack.enter_context(stored_file(f[0])), *f[1:]) for f in files]
+                loaded, more["depths"] = with_recordings(loaded, given)
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m, **more)
 
     def make_insert(
-        self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, worn: tuple, origin: Origin
+        self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, beside: tuple, origin: Origin
     ) -> None:
         from pbl_pipeline.qc import worst
 
-        session_id = session_of_set(key)  # locked: no sensors are attached from here on
-        if _sensors_now(key, "LOCK IN SHARE MODE") != worn:
-            raise InputChanged("other wearable sensors than were fitted", key)
+        session_id = session_of_set(key)  # locked: no sensors or depths are attached from here on
+        if _beside(key, "LOCK IN SHARE MODE") != beside:
+            raise InputChanged("other wearable sensors or depth recordings than were fitted", key)
         body_sha = result.trials[0].body_sha256
         with new_folder() as folder:
             arrays = {n: np.asarray(getattr(result, n), np.float32) for n in ("scale", "site_offset_m", "loss_trace")}
@@ -249,6 +257,7 @@ class SessionFit(dj.Computed):
                     }
                 )
                 self.Sensor.insert_records({**key, "video_id": video_id}, trial.sensors)
+                self.Depth.insert_records({**key, "video_id": video_id}, [trial.depth] if trial.depth else [])
         self.Check.insert_records(key, result.qc)
 
 
@@ -268,21 +277,32 @@ def _people(sets: Any) -> Any:
     return sets.proj("session_id") * session.Session.proj("subject") * lab.Subject.proj("subject_height")
 
 
-def _sensors_now(key: Mapping[str, Any], lock: str = "") -> tuple:
-    """Bytes, segments and rates of the logs of wearable sensors that a set is fitted with; empty for markers. lock:
-    clause by which a transaction sees what others have committed."""
+def _beside(key: Mapping[str, Any], lock: str = "") -> tuple[tuple, tuple]:
+    """Recordings that a set is fitted with beside keypoints: bytes, segments and rates of the logs of wearable sensors,
+    none for markers; videos, bytes and scales of depth recordings, of one camera each. lock: clause by which a
+    transaction sees what others have committed."""
     visit, kind = one(FitSet & {"fit_set": key["fit_set"]}, "session_id", "fit_set_kind")
-    if kind == MARKERS:
-        return ()
-    logs, videos = video.WearableImu.full_table_name, video.Video.full_table_name
-    # Plain SQL: a lock does not reach into the subqueries of DataJoint's joins.
-    return tuple(
-        video.WearableImu.connection.query(
-            f"SELECT imu_sha256, imu_segments, imu_rate FROM {logs} JOIN {videos} USING (video_id)"  # noqa: S608
-            f" WHERE session_id = %s AND imu_segments IS NOT NULL ORDER BY imu_sha256 {lock}",
-            args=(int(visit),),
-        ).fetchall()
+    logs, depths = video.WearableImu.full_table_name, video.DepthVideo.full_table_name
+    videos, of_set = video.Video.full_table_name, FitSet.Video.full_table_name
+
+    def rows(query: str, value: Any) -> tuple:  # plain SQL: a lock does not reach into subqueries of DataJoint's joins
+        return tuple(FitSet.connection.query(f"{query} {lock}", args=(value,)).fetchall())
+
+    worn = (
+        f"SELECT imu_sha256, imu_segments, imu_rate FROM {logs} JOIN {videos} USING (video_id)"  # noqa: S608
+        " WHERE session_id = %s AND imu_segments IS NOT NULL ORDER BY imu_sha256"
     )
+    seen = (
+        f"SELECT video_id, depth_sha256, depth_scale FROM {depths} JOIN {of_set} USING (video_id)"  # noqa: S608
+        " WHERE fit_set = %s AND depth_read ORDER BY video_id"
+    )
+    return rows(worn, int(visit)) if kind != MARKERS else (), rows(seen, key["fit_set"]) if kind == SINGLE else ()
+
+
+def _depths(rows: Sequence[tuple]) -> dict[int, tuple]:
+    """File of the store, scale and name of depth recordings, by their videos; rows: of `_beside`."""
+    found = (video.DepthVideo & inside("video_id", [int(row[0]) for row in rows])).to_dicts() if rows else []
+    return {r["video_id"]: (file_ref(r["depth_file"]), number(r["depth_scale"]), r["depth_name"]) for r in found}
 
 
 def _worn(session_id: int, names: Mapping[int, str]) -> tuple[list[tuple], dict[str, str | None]]:
@@ -328,6 +348,12 @@ def sensor_fits(session_id: int) -> Any:
     """Fits of a visit of which its wearable sensors are, or would be, a part."""
     sets = FitSet & {"session_id": session_id} & f"fit_set_kind <> '{MARKERS}'"
     return SessionFit & sets.proj()
+
+
+def delete_depth_fits(video_id: int) -> dict[str, int]:
+    """Delete the fits that the depth recording of a video is part of; returns the rows as `delete_below`."""
+    sets = FitSet & {"fit_set_kind": SINGLE} & (FitSet.Video & {"video_id": video_id}).proj()
+    return delete_below(SessionFit, (SessionFit & sets.proj()).keys())
 
 
 def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:

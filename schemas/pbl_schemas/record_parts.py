@@ -82,7 +82,8 @@ def part_of(
         Tables whose keys are in its own.
     """
     own = [d.path[0] for d in declared(record) if d.column.key and key]
-    lines = [f"# {comment}"] * bool(comment) + [f"-> {table}" for table in of] + [key, "---"] * bool(key)
+    lines = [f"# {comment}"] * bool(comment) + [f"-> {table}" for table in of] + [key] * bool(key)
+    lines += ["---"] * (bool(key) or not any(d.column.key for d in declared(record)))  # `definition` ends its own key
     number = key.partition(":")[0].strip() if ":" in key else ""
     text = "\n".join([*lines, definition(record, prefix, without=own)])
     return _part(name, Records, {"definition": text, "record": record, "prefix": prefix, "number": number})

@@ -158,15 +158,17 @@ class WearableImu(dj.Manual):
 @schema
 class DepthVideo(dj.Manual):
     definition = """
-    # depth recording of the same phone beside a video: kept, not read
+    # depth recording beside a video of one camera; the fit of the visit reads it
     -> Video
     ---
-    depth_name     : varchar(255)              # name of the file
-    depth_sha256   : char(64)                  # of its bytes
-    depth_size     : int64                     # (byte) length
-    depth_created  : datetime                  # when registered, UTC
-    depth_file     : <object@arrays>          # the file
-    """
+    depth_name       : varchar(255)            # name of the file or folder
+    depth_read=null  : bool                    # false, and null of older rows: kept, not read
+    depth_scale=null : float64                 # (m) one step of its 16-bit pictures, as a person stated; null: the recording says it
+    depth_sha256     : char(64)                # of the copy's bytes
+    depth_size       : int64                   # (byte) length of the copy
+    depth_created    : datetime                # when registered, UTC
+    depth_file       : <object@arrays>        # the recording; a folder as zip
+    """  # noqa: E501
 
 
 @schema

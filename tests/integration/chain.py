@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,6 +25,7 @@ from pbl_pipeline.fit import SessionFit, TrialFit, session_fit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import compute
 from pbl_pipeline.qc import Check
+from pbl_pipeline.results import DepthFit
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import VideoInfo, check_lens, probe, read_frames
@@ -119,18 +121,32 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     return dataclasses.replace(found, camera=camera)
 
 
-def fit_session(trials, names, paramset=None, camera_motion="static", height_m=None) -> SessionFit:
-    """The movement that was put in; as many time stamps as the keypoints have."""
-    body = load_body()
+def depth_pictures(folder: Path, metres: float = 3.0, n: int = N_FRAMES) -> Path:
+    """16-bit pictures in mm of a wall, one for each frame of a small video."""
+    folder.mkdir()
+    for i in range(n):
+        cv2.imwrite(str(folder / f"{i}.png"), np.full((18, 32), 1000 * metres, np.uint16))
+    return folder
+
+
+def fit_session(trials, names, paramset=None, camera_motion="static", height_m=None, depths=()) -> SessionFit:
+    """The movement that was put in; as many time stamps as the keypoints have. Depths make the body larger."""
+    body, metre = load_body(), np.nanmedian([np.nanmedian(d.m) for d in depths if d] or [1.0])
+    found = [d and DepthFit(d.name, d.sha256, 0.6, 0.95, 1.1, 0.93, float(metre)) for d in depths] or [None] * len(
+        names
+    )
     fits = tuple(
         dataclasses.replace(
-            walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(k.time_s)), height_m=height_m or np.nan
+            walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(k.time_s)),
+            height_m=height_m or np.nan,
+            with_depths=bool(depths),
+            depth=depth,
         )
-        for name, k in zip(names, trials, strict=True)
+        for name, k, depth in zip(names, trials, found, strict=True)
     )
     return SessionFit(
         trials=fits,
-        scale=np.ones(8),
+        scale=np.full(8, metre),
         site_offset_m=np.zeros((1, 3)),
         loss_trace=np.array([[0.0, 20.0], [7.0, 2.0]]),
         iterations=7,

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import pbl_schemas
+from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from pbl_schemas import connection, gait, lab, load_visit, migrations, video
-from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas import connection, fit, gait, lab, load_visit, migrations, video
+from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.operations import backup, backup_files, embedded
 from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.reading import frames
@@ -41,8 +42,11 @@ def filled(folder: Path) -> None:
     """One visit through the whole chain, one error row, and awkward values."""
     declare_all()
     (folder / "notes.mp4").write_text("not a video")
-    ingest([chain.small_video(folder, "walk"), folder / "notes.mp4"], VisitRecord(subject="P001", project="gait"))
+    depth = Sensors(depth=DepthFile(chain.depth_pictures(folder / "depth"), 0.001))
+    paths = chain.small_video(folder, "walk"), folder / "notes.mp4"
+    ingest(paths, VisitRecord(subject="P001", project="gait"), files=[depth, Sensors()])
     populate()
+    assert len(fit.SessionFit.Depth()) == 1
     lab.Project.update1({"project": "gait", "project_title": TITLE})
     lab.Subject.update1({"subject": "P001", "subject_height": HEIGHT})
 

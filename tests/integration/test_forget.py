@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pbl_schemas import connection, keypoints, lab, session, video
-from pbl_schemas.intake import VisitRecord, ingest
+from pbl_pipeline.depth import DepthFile
+from pbl_schemas import connection, fit, keypoints, lab, session, video
+from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.operations import forget
 from pbl_schemas.operations.declare import declare_all
 from pbl_workers.populate import populate
@@ -46,12 +47,15 @@ def two(database: Path, tmp_path: Path, stand_ins: None) -> Iterator[tuple[dict,
     videos = [chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "waits", people="two alike")]
     (tmp_path / "notes.mp4").write_text("not a video")
     videos.append(tmp_path / "notes.mp4")
+    depth = Sensors(depth=DepthFile(chain.depth_pictures(tmp_path / "depth"), 0.001))
     numbers = [
         register(path, subject="P017", session_label="2026-03-01", camera_file=lens)[0]
         for path, lens in zip(videos, (own, shared, None), strict=True)
     ]
     assert len(lab.CameraCalibration()) == 2
+    ingest(videos[:1], VisitRecord(subject="P017", session_label="2026-03-01"), files=[depth])
     populate()
+    assert len(fit.SessionFit.Depth()) == 1
     # The queues have finished rows of this person, too; and a computation that was killed left a file without a row.
     number = numbers[0]
     _queue(video.VideoInfo, "error", number)

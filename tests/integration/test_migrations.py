@@ -176,6 +176,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0013,
         older_tables.undo_0012,
         older_tables.undo_0010,
         older_tables.undo_0009,
@@ -378,6 +379,7 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert {"session_gdi_unshrunk", "session_gdi_unshrunk_sd"} < set(gdi.SessionGdi.heading.names)
     assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert {"imu_segments", "imu_rate"} < set(video.WearableImu.heading.names)
+    assert {"depth_read", "depth_scale"} < set(video.DepthVideo.heading.names)
     assert migrations.migrate().steps == []
 
 

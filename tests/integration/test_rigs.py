@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from pbl_schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video
 from pbl_schemas.decisions.review_decisions import decide_person
-from pbl_schemas.intake import SeveralCameras, VisitRecord, ingest, register
+from pbl_schemas.intake import Sensors, SeveralCameras, VisitRecord, ingest, register
 from pbl_schemas.job_errors import error_code
 from pbl_schemas.operations.forget import forget
 from pbl_schemas.plan import fit_set_hash
@@ -270,6 +271,8 @@ def test_trials_that_cannot_be_are_refused(rig: None, tmp_path: Path):
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
     assert outcomes(ingest([one], VisitRecord("P001", camera_file=toml))) == ["USAGE"]
+    depth = Sensors(depth=DepthFile(tmp_path))
+    assert outcomes(ingest([one], VisitRecord("P001"), files=[depth])) == ["USAGE"]
     assert len(video.Video()) == 3
 
 

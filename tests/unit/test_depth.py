@@ -14,23 +14,35 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import capsules, load_body, ray_lengths
-from pbl_pipeline.cli.fit import _with_depths
 from pbl_pipeline.cli.options import depth_files
-from pbl_pipeline.depth import Depth, at_points, read_depth
+from pbl_pipeline.depth import (
+    Depth,
+    DepthFile,
+    PointDepths,
+    at_points,
+    pack,
+    read_depth,
+    sha256_of_recording,
+    with_recordings,
+)
 from pbl_pipeline.depth.folders import read_folder
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import GaussNewtonParams, fit_session
+from pbl_pipeline.files import sha256_of
+from pbl_pipeline.fit import GaussNewtonParams, TrialFit, fit_session
 from pbl_pipeline.fit.checks import _depths
-from pbl_pipeline.fit.depths import DepthFit, check_depths, shares_of_floors, with_depths
+from pbl_pipeline.fit.depths import check_depths, shares_of_floors, with_depths
 from pbl_pipeline.fit.per_frame import start_of
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.qc import FAIL, PASS, WARN
+from pbl_pipeline.records import plain
+from pbl_pipeline.results import DepthFit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.video import Camera
 
 N, HEIGHT, WIDTH = 12, 24, 32
-#: A video of 4:3.
+#: A video of 4:3, and one of a phone that was turned.
 TIME_S, SIZE_PX = 7.0 + np.arange(N) / 30, (640, 480)
+PORTRAIT_PX = (480, 640)
 MATRIX = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
 
 
@@ -56,10 +68,19 @@ def millimetres(i: int) -> np.ndarray:
     return (1000 * depths(i)).astype(np.uint16)
 
 
-def stray(folder: Path, end: str = "png") -> Path:
+#: Quaternions (x, y, z, w) of a camera that looks ahead: clockwise turn of its pictures that makes them upright.
+HELD = {
+    0: "1, 0, 0, 0",
+    90: "0.70710678, -0.70710678, 0, 0",
+    180: "0, 1, 0, 0",
+    270: "0.70710678, 0.70710678, 0, 0",
+}
+
+
+def stray(folder: Path, end: str = "png", held: int = 0) -> Path:
     write(folder / "depth", millimetres, end=end)
     write(folder / "confidence", lambda i: np.full((HEIGHT, WIDTH), 2, np.uint8))
-    rows = "".join(f"{100 + t:.4f}, {i:06d}, 0, 0, 0, 0, 0, 0, 1\n" for i, t in enumerate(TIME_S))
+    rows = "".join(f"{100 + t:.4f}, {i:06d}, 0, 0, 0, {HELD[held]}\n" for i, t in enumerate(TIME_S))
     (folder / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy, qz, qw\n" + rows)
     (folder / "camera_matrix.csv").write_text("600.0, 0.0, 320.0\n0.0, 600.0, 240.0\n0.0, 0.0, 1.0\n")
     return folder
@@ -77,8 +98,12 @@ def record3d(path: Path, wrong: bytes = b"") -> Path:
 
 
 def refused(path: Path, scale_m: float | None = None) -> PblError:
+    return refused_beside(path, SIZE_PX, scale_m)
+
+
+def refused_beside(path: Path, size_px: tuple[int, int], scale_m: float | None = None) -> PblError:
     with pytest.raises(PblError) as caught:
-        read_depth(path, TIME_S, SIZE_PX, scale_m)
+        read_depth(path, TIME_S, size_px, scale_m)
     assert caught.value.code == "DEPTH_FILE"
     return caught.value
 
@@ -201,7 +226,7 @@ def test_depth_at_a_point_is_that_of_one_surface():
         xy_px=np.tile(xy, (3, 1, 1)),
         confidence=np.ones((3, len(places))),
     )
-    found = at_points(depth, keypoints)
+    found = at_points(depth, keypoints).m
     nan = np.nan
     # On the limb, beside it, on the wall, in a small hole, in a large one, far, not confident, at the corner, outside.
     np.testing.assert_allclose(found[0, :, 0], [1.5, 3, 3, nan, nan, nan, nan, nan, nan], atol=0.011)
@@ -254,7 +279,9 @@ def test_depths_on_the_way_into_a_fit(monkeypatch: pytest.MonkeyPatch):
     wrong, lost = depth.copy(), rng.random((2, *depth.shape[:2])) < 0.3
     wrong[lost[0], 0] += 1  # a wall beside the limb
     wrong[lost[0] & lost[1], 1] += 1
-    p, start, share = with_depths(dataclasses.replace(session, depths=(wrong,)), session.problem, state, x, 0.5)
+    p, start, share = with_depths(
+        dataclasses.replace(session, depths=(PointDepths(wrong),)), session.problem, state, x, 0.5
+    )
     assert p.depths is not None
     assert start.surface is not None
     assert float(start.surface.metre) == pytest.approx(1 / 1.1, rel=0.01)
@@ -270,7 +297,7 @@ def test_depths_on_the_way_into_a_fit(monkeypatch: pytest.MonkeyPatch):
     # Another person's recording: depths of a wall, and of a path that comes nearer.
     away = np.broadcast_to(np.linspace(1, 4.5, len(depth))[:, None, None], depth.shape)
     with pytest.raises(PblError, match="DEPTH_FILE"):
-        with_depths(dataclasses.replace(session, depths=(away,)), session.problem, state, x, 0.5)
+        with_depths(dataclasses.replace(session, depths=(PointDepths(away),)), session.problem, state, x, 0.5)
 
 
 def test_the_trial_with_a_wrong_recording_is_named():
@@ -283,7 +310,7 @@ def test_the_trial_with_a_wrong_recording_is_named():
     for i in range(3):
         qpos[at[i]][:n], markers[at[i]][:n] = q, x[:n]
     state: Any = dataclasses.replace(state, qpos=qpos, R_nc=np.asarray(state.R_nc))
-    away = np.broadcast_to(np.linspace(1, 4.5, n)[:, None, None], depth.shape)
+    depth, away = (PointDepths(d) for d in (depth, np.broadcast_to(np.linspace(1, 4.5, n)[:, None, None], depth.shape)))
     args: Any = session.problem, state, markers, 0.5
     *_, share = with_depths(dataclasses.replace(session, depths=(depth, None, depth)), *args)
     assert np.isnan(share[1])
@@ -296,9 +323,9 @@ def test_depths_of_other_trials_are_refused():
     assert check_depths((None,), session.trials) == ()
     for bad in ((depth[1:],), (depth, depth), (np.full(depth.shape, np.nan),)):
         with pytest.raises(PblError, match="DEPTH_FILE"):
-            check_depths(bad, session.trials)
+            check_depths([PointDepths(d) for d in bad], session.trials)
     with pytest.raises(PblError, match="FIT_INPUT"):
-        fit_session([made.keypoints], ["walk"], "paper-2025", depths=[depth])
+        fit_session([made.keypoints], ["walk"], "paper-2025", depths=[PointDepths(depth)])
 
 
 @pytest.mark.parametrize(
@@ -312,20 +339,19 @@ def test_depths_of_other_trials_are_refused():
     ],
 )
 def test_checks_of_depths(changed: dict[str, float], name: str, outcome: str):
-    good = {"used": 0.5, "fits": 0.95, "distance": 0.92, "after": 1.0, "z": 1.1}
-    values = good | changed
-    distance = values.pop("distance")
-    each = {k: np.array([v, np.nan]) for k, v in values.items()}  # the second is a trial without a recording
-    checks = _depths(DepthFit(**each, distance=distance, metre=1.0))
+    good = {"used": 0.5, "fits": 0.95, "distance": 0.92, "z": 1.1}
+    checks = _depths([DepthFit("a", "0" * 64, **good | changed, metre=1.0)])
     assert [(c.check, c.outcome) for c in checks if c.outcome != PASS] == ([(name, outcome)] if name else [])
-    assert _depths(None) == []
+    assert _depths([]) == []
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_fit_with_depths_is_in_their_metres():
+def test_a_fit_with_depths_is_in_their_metres(tmp_path: Path):
     made, _, _, _, depth = filmed(1.0)
-    fit = fit_session([made.keypoints], ["walk"], "blazepose", depths=[depth], height_m=1.9)
+    fit = fit_session(
+        [made.keypoints], ["walk"], "blazepose", depths=[PointDepths(depth, "a.r3d", "0" * 64)], height_m=1.9
+    )
     trial = fit.trials[0]
     hips = np.asarray(trial.markers_world_m)[:, [trial.marker_names.index(f"{s}_hip") for s in ("left", "right")]]
     seen = made.truth.markers_world_m[:, [trial.marker_names.index(f"{s}_hip") for s in ("left", "right")]]
@@ -333,8 +359,11 @@ def test_a_fit_with_depths_is_in_their_metres():
     assert ratio == pytest.approx(1.0, abs=0.01)
     assert trial.with_depths
     assert trial.sized
-    assert fit.depth is not None
-    assert fit.depth.after[0] == pytest.approx(1.0, abs=0.005)
+    assert trial.depth is not None
+    assert (trial.depth.name, trial.depth.sha256) == ("a.r3d", "0" * 64)
+    assert 0.3 < trial.depth.used <= 1
+    trial.save(tmp_path / "a.fit.npz")
+    assert plain(TrialFit.load(tmp_path / "a.fit.npz").depth) == plain(trial.depth)
 
 
 def test_keypoints_take_the_camera_and_the_depths_of_a_recording(tmp_path: Path):
@@ -344,17 +373,83 @@ def test_keypoints_take_the_camera_and_the_depths_of_a_recording(tmp_path: Path)
     matrix = f"1600, 0, {width / 2}\n0, 1600, {height / 2}\n0, 0, 1\n"
     (folder / "camera_matrix.csv").write_text(matrix)
     guessed = dataclasses.replace(made, camera=dataclasses.replace(made.camera, source="guess: a phone"))
-    (trial, other), (depth, none) = _with_depths([guessed, made], [folder, None], 0.001)
+    (trial, other), (depth, none) = with_recordings([guessed, made], [DepthFile(folder, 0.001), None])
     assert trial.camera.focal_px == 1600
     assert other is made
     assert none is None
-    assert set(depth[np.isfinite(depth)]) == {3.0}
-    assert depth.shape == (*made.confidence.shape, 2)
-    assert _with_depths([made], [None], None) == ([made], [])
-    assert depth_files(["none", "b"], 2, 0.001) == [None, Path("b")]
+    assert depth is not None
+    assert set(depth.m[np.isfinite(depth.m)]) == {3.0}
+    assert depth.m.shape == (*made.confidence.shape, 2)
+    assert (depth.name, depth.sha256) == ("a", sha256_of_recording(folder))
+    assert with_recordings([made], [None]) == ([made], [None])
     with pytest.raises(PblError, match="USAGE"):
-        depth_files(["b"], 2, None)
+        with_recordings([SimpleNamespace(markers="of a laboratory")], [DepthFile(folder, 0.001)])
+
+
+def test_recordings_are_named_with_their_own_scale():
+    files = ["none", "0.001=a", "0.00025=b/c", "x=d", "nan=e"]
+    paths = (
+        DepthFile(Path("a"), 0.001),
+        DepthFile(Path("b/c"), 0.00025),
+        DepthFile(Path("x=d")),
+        DepthFile(Path("nan=e")),
+    )
+    assert depth_files(files, 5) == [None, *paths]
+    assert depth_files([], 2) == [None, None]
     with pytest.raises(PblError, match="USAGE"):
-        depth_files([], 2, 0.001)
-    with pytest.raises(PblError, match="USAGE"):
-        _with_depths([SimpleNamespace(markers="of a laboratory")], [folder], 0.001)
+        depth_files(["b"], 2)
+
+
+def test_a_zip_is_read_as_its_folder(tmp_path: Path):
+    """As the tables keep it; its bytes do not depend on when it was written, nor on what is not read."""
+    for name, folder, scale in (("s", stray(tmp_path / "s"), None), ("p", write(tmp_path / "p", millimetres), 0.001)):
+        (folder / "rgb.mp4").write_bytes(b"pictures")
+        zipped = pack(folder, tmp_path / f"{name}.zip")
+        assert sha256_of(zipped) == sha256_of_recording(folder)
+        assert "rgb.mp4" not in zipfile.ZipFile(zipped).namelist()
+        kept = tmp_path / f"{name}_of_the_store"
+        zipped.rename(kept)
+        (of_zip, sure), (of_folder, _) = (next(read_depth(p, TIME_S, SIZE_PX, scale).read([7])) for p in (kept, folder))
+        np.testing.assert_array_equal(of_zip, of_folder)
+        assert (sure is None) == (scale is not None)
+    with zipfile.ZipFile(kept, "r") as archive, zipfile.ZipFile(tmp_path / "cut.zip", "w") as cut:
+        for member in archive.namelist()[:4]:
+            cut.writestr(member, archive.read(member))
+    with pytest.raises(PblError, match="4 depth pictures for 12") as caught:
+        read_depth(tmp_path / "cut.zip", TIME_S, SIZE_PX, 0.001, "walk")
+    assert caught.value.key == "walk"
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_pictures_of_a_turned_phone_are_turned_as_it_was_held(tmp_path: Path, turn: int):
+    """The video is upright; what Stray Scanner writes lies as the sensor does."""
+    upright = [np.rot90(depths(i), -turn // 90) for i in range(N)]
+    size, other = (PORTRAIT_PX, SIZE_PX) if turn % 180 else (SIZE_PX, PORTRAIT_PX)
+    folder = stray(tmp_path / "a", held=turn)
+    (folder / "camera_matrix.csv").write_text("600.0, 0.0, 325.0\n0.0, 610.0, 236.0\n0.0, 0.0, 1.0\n")
+    found = read_depth(folder, TIME_S, size)
+    (depth, sure) = next(found.read([3]))
+    np.testing.assert_allclose(depth, upright[3], atol=1e-3)
+    assert sure is not None
+    assert sure.shape == depth.shape
+    # A point of the sensor's picture, turned with it.
+    wanted = {0: (325, 236), 90: (479 - 236, 325), 180: (639 - 325, 479 - 236), 270: (236, 639 - 325)}[turn]
+    assert found.matrix is not None
+    np.testing.assert_allclose(found.matrix[:2, 2], wanted)
+    np.testing.assert_allclose(np.diag(found.matrix)[:2], (610, 600) if turn % 180 else (600, 610))
+    # The video lies on its side, or stands when the phone did not.
+    with pytest.raises(PblError, match="turned by 90 deg") as caught:
+        read_depth(folder, TIME_S, other)
+    assert "so that the person is upright" in caught.value.next_step
+    # Not known how it was held: pictures and video must agree.
+    (folder / "odometry.csv").write_text("timestamp\n" + "".join(f"{t}\n" for t in TIME_S))
+    if turn % 180:
+        assert "turned by 90 deg" in refused_beside(folder, size).found
+    # Turned by hand before.
+    elif turn == 0:
+        by_hand = stray(tmp_path / "b", held=90)
+        write(by_hand / "depth", lambda i: np.rot90(millimetres(i), -1).copy())
+        write(by_hand / "confidence", lambda i: np.full((WIDTH, HEIGHT), 2, np.uint8))
+        (by_hand / "camera_matrix.csv").write_text("600, 0, 240\n0, 600, 320\n0, 0, 1\n")
+        (depth, _) = next(read_depth(by_hand, TIME_S, PORTRAIT_PX).read([3]))
+        np.testing.assert_allclose(depth, np.rot90(depths(3), -1), atol=1e-3)

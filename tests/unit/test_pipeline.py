@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from pbl_pipeline import pipeline
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.run import run
+from pbl_pipeline.depth import sha256_of_recording
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.report import write_report
@@ -73,6 +74,33 @@ def test_the_report_of_a_run_is_german_where_that_is_asked_for(
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "Person im Bild (s) (walk_a)" in page
     assert not english_of(page, english_words(), REPORT_NAMES + r"|walk_[ab](\.mp4)?|Scale|stand-in|test")
+
+
+@pytest.mark.slow
+def test_report_and_session_name_the_depth_recording_of_a_run(
+    fitted: list[list[str]], tmp_path: Path, stand_in: StandIn
+):
+    def detect(video_path, tracking, person_id, camera, params=None):  # of a small video
+        points = chain.detect_keypoints(video_path, tracking, person_id, camera, params)
+        small = points.xy_px * (128 / points.image_size_px[0])
+        return dataclasses.replace(points, xy_px=small, image_size_px=(128, 72), camera=camera)
+
+    stand_in(**chain.NO_PICTURES, detect_keypoints=detect, fit_session=chain.fit_session)
+    paths = [str(chain.small_video(tmp_path, name)) for name in ("walk", "without", "wrong")]
+    folders = [chain.depth_pictures(tmp_path / name, n=n) for name, n in (("deep", 240), ("few", 9))]
+    given = [f"0.001={folders[0]}", "none", f"0.002={folders[1]}"]
+    depths = [part for text in given for part in ("--depth", text)]
+    done = CliRunner().invoke(run, [*paths, *depths, "--out", str(tmp_path / "out")], catch_exceptions=False)
+    assert "DEPTH_FILE" in done.output
+    sha256 = sha256_of_recording(folders[0])
+    content = json.loads((tmp_path / "out" / "session.json").read_text())
+    assert content["trials"] == ["walk", "without"]
+    assert {n: (d["name"], d["sha256"], d["metre"]) for n, d in content["depths"].items()} == {
+        "walk": ("deep", sha256, 3.0)
+    }
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert page.count(sha256) == 1
+    assert "Depth recording" in page
 
 
 @pytest.mark.slow

@@ -81,10 +81,9 @@ _METHODS = ("tracking", "keypoint", "fit", "gdi", "norm", "kinetics")
 )
 @click.option(
     "--depth",
-    type=click.Path(path_type=Path),
     multiple=True,
-    metavar="FILE",
-    help="Depth recording, once for each video; it is kept, not read.",
+    metavar="[SCALE=]FILE",
+    help="Depth recording (docs/depth.md), once for each video, in their order; 'none' for no recording.",
 )
 @click.option(
     "--imu",
@@ -122,7 +121,7 @@ def ingest(
     rig: Path | None,
     name_pattern: str | None,
     attitude: tuple[Path, ...],
-    depth: tuple[Path, ...],
+    depth: tuple[str, ...],
     imu: tuple[str, ...],
     **stated: Any,
 ) -> None:
@@ -130,10 +129,10 @@ def ingest(
     laboratory markers, of one visit; `pbl populate` then computes them. No video is decoded here.
 
     A file whose bytes are registered already is not registered twice, but takes a new camera (what was computed with
-    another is deleted and listed), a sensor log of the phone (the same), activity, pace and further methods. Logs,
-    depth videos, IMU files, markers and calibrations of a rig are copied. Videos of one camera, trials of several and
-    markers of a visit are fitted apart. Exit code 1 when a file was refused; the others are registered all the same,
-    but a trial of several cameras whole or not at all.
+    another is deleted and listed), a sensor log of the phone (the same), depths, activity, pace and further methods.
+    Logs, depth recordings, IMU files, markers and calibrations of a rig are copied. Videos of one camera, trials of
+    several and markers of a visit are fitted apart. Exit code 1 when a file was refused; the others are registered all
+    the same, but a trial of several cameras whole or not at all.
 
     \b
     Example: pbl ingest walk1.mp4 walk2.mp4 --subject P017 --session 2026-03-01
@@ -274,9 +273,10 @@ def _one_kind(
             raise click.UsageError(text)
 
 
-def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[str, ...]) -> list[Sensors]:
+def _files(n: int, attitude: tuple[Path, ...], depth: tuple[str, ...], imu: tuple[str, ...]) -> list[Sensors]:
     """Sensor files of each of the n videos; the first has those that the person wore. Raises `PblError` USAGE where
     files and videos do not match, what `given_sensors` raises."""
+    from pbl_pipeline.depth import DepthFile
     from pbl_pipeline.sensors import given_sensors, named
     from pbl_schemas.intake import Sensors
     from pbl_schemas.intake.records import usage
@@ -287,12 +287,11 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tup
             raise usage(
                 f"{len(given)} times {what} for {n} videos",
                 "none, or one for each video, in the same order",
-                next_step="name a file for each video"
-                + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
+                next_step="name a file for each video, 'none' for one without",
             )
     worn = [sensor for text in imu for one in given_sensors(text) for sensor in named(one)]
     if n > 1 and (files := [one.file.name for one in worn if one.segment is None and str(one.file) != NONE]):
         alone = "name the segment, such as --imu shank_r=FILE, or ingest that video in a separate call"
         raise usage(f"--imu {files[0]} for {n} videos", "the segment of a sensor", next_step=alone)
-    logs, depths = (list(given) or [None] * n for given in (attitude, depth))
+    logs, depths = list(attitude) or [None] * n, [DepthFile.of(text) for text in depth] or [None] * n
     return [Sensors(a, d, worn if i == 0 else ()) for i, (a, d) in enumerate(zip(logs, depths, strict=True))]

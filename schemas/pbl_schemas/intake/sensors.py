@@ -1,17 +1,17 @@
-"""Files that belong to a video, copied to the store: the phone's sensor log, depth video, logs of wearable sensors."""
+"""Files that belong to a video, copied to the store: the phone's log, depth recording, logs of wearable sensors."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
-import shutil
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import sha256_of
+from pbl_pipeline.files import sha256_packed, zipped
+from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
 
 from .. import fit, keypoints, session, video
@@ -21,20 +21,22 @@ from ..transactions import in_transaction
 from .records import usage
 
 if TYPE_CHECKING:
+    from pbl_pipeline.depth import DepthFile
     from pbl_pipeline.sensors import Given
     from pbl_pipeline.video import PhoneLog
 
-#: As a path of `--attitude` or `--imu`: no log for this video, no sensors at its visit, or no longer.
+#: As a path of `--attitude`, `--depth` or `--imu`: none for this video or at its visit, or no longer.
 NONE = "none"
+_NOT_READ = ", kept and not read: not a folder, .r3d or zip (docs/depth.md)"
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; imu: sensors that the person
-    wore at its visit; sums: SHA-256 of the files, once they were read."""
+    """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; depth: a recording, or
+    `NONE`; imu: sensors that the person wore at its visit; sums: SHA-256 of the files, once they were read."""
 
     attitude: Path | None = None
-    depth: Path | None = None
+    depth: DepthFile | None = None
     imu: Sequence[Given] = ()
     sums: Mapping[Path, str] = dataclasses.field(default_factory=dict)
 
@@ -50,31 +52,36 @@ class Sensors:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and their sums, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT
         for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
+        from pbl_pipeline.depth import sha256_of_recording
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
-        for path in (self.depth, *(given.file for given in self.imu)):
-            if path is not None and str(path) != NONE and not path.is_dir():
+        depth = {self.depth.file} if self.depth is not None else set()
+        for path in (*depth, *(given.file for given in self.imu)):
+            if str(path) != NONE and not path.is_dir():
                 _check_there(path)
         logs = iter(read_given([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        files = {self.attitude, self.depth, *(given.file for given in imu)} - {None, Path(NONE)}
-        return dataclasses.replace(self, imu=imu, sums={path: _sha256(path) for path in files if path is not None}), log
+        files = {self.attitude, *(given.file for given in imu)} - {None, Path(NONE)}
+        sums = {path: sha256_packed(path, _zipped) for path in files if path is not None}
+        sums |= {path: sha256_of_recording(path) for path in depth - {Path(NONE)}}
+        return dataclasses.replace(self, imu=imu, sums=sums), log
 
 
 def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
     """Insert what the video does not have yet, of files that were read (`Sensors.read`); returns it in words. Call it
     in a transaction.
 
-    Another log (or none) takes the older one's place, and what was computed with that is deleted: keypoints and after.
+    Another log or recording (or none) takes the older one's place, and what was computed with that is deleted: with a
+    phone's log keypoints and after, with depths the fit and after.
     """
     key = {"video_id": video_id}
     done = []
     if given.attitude is not None:
         done += _attach_log(key, given.attitude, given.sums, log)
-    if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth, given.sums)):
-        done.append(f"depth video {given.depth.name} was {how}")
+    if given.depth is not None:
+        done += _attach_depth(key, given.depth, given.sums)
     return done + _attach_sensors(key, given.imu, given.sums)
 
 
@@ -118,6 +125,29 @@ def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: 
     return [
         f"the phone's log of {len(log.time_s)} orientations ({log.form}) was {how}" + delete_keypoints(key["video_id"])
     ]
+
+
+def _attach_depth(key: dict[str, Any], given: DepthFile, sums: Mapping[Path, str]) -> list[str]:
+    """Attach a depth recording to a video, or remove its older one, and delete the fits that were made otherwise."""
+    from pbl_pipeline.depth import pack
+
+    table, removed = video.DepthVideo & key, str(given.file) == NONE
+    before = [(r["depth_sha256"], bool(r["depth_read"]), number(r["depth_scale"])) for r in table.to_dicts()]
+    now = [] if removed else [(sums[given.file], given.known, given.scale_m)]
+    if before == now:
+        return []
+    session.lock(int((video.Video & key).fetch1("session_id")))  # no fit is inserted from here on
+    table.delete(prompt=False)
+    done = ["the depth recording was removed"]
+    if not removed:
+        about = {"depth_read": given.known, "depth_scale": given.scale_m}
+        _keep(video.DepthVideo, "depth", key, given.file, sums, about, pack)
+        how = "replaced" if before else "attached"
+        done = [f"depth recording {given.file.name} was {how}" + ("" if given.known else _NOT_READ)]
+    was_read = any(read for _, read, _ in before + now)
+    if was_read and (rows := counted(fit.delete_depth_fits(key["video_id"]))):
+        done.append(f"what was fitted before was deleted: {rows}")
+    return done
 
 
 def _attach_sensors(key: dict[str, Any], given: Sequence[Given], sums: Mapping[Path, str]) -> list[str]:
@@ -193,14 +223,6 @@ def carriers(numbers: Sequence[int]) -> list[dict[str, Any]]:
     return [row for row in rows if row["imu_segments"]]
 
 
-def _sha256(path: Path) -> str:
-    """Of a file's bytes, or of those of a folder's zip."""
-    if path.is_file():
-        return sha256_of(path)
-    with new_folder() as folder:
-        return sha256_of(_zipped(path, folder / "log.zip"))
-
-
 def _keep(
     table: Any,
     prefix: str,
@@ -208,14 +230,15 @@ def _keep(
     path: Path,
     sums: Mapping[Path, str],
     about: dict[str, Any] | None = None,
+    pack: Callable[[Path, Path], Path] | None = None,
 ) -> str:
-    """Insert a file, or a folder as a zip, as the row with this key; return "attached", "replaced" for an older one, or
-    "" for the same bytes."""
+    """Insert a file, or a folder as the zip that `pack` writes, as the row with this key; return "attached", "replaced"
+    for an older one, or "" for the same bytes."""
     before = (table & key).to_dicts()
     if before and before[0][f"{prefix}_sha256"] == sums[path]:
         return ""
     with new_folder() as folder:
-        file = path if path.is_file() else _zipped(path, folder / f"{prefix}.zip")
+        file = path if path.is_file() else (pack or _zipped)(path, folder / f"{prefix}.zip")
         (table & key).delete(prompt=False)
         table.insert1(
             {
@@ -239,14 +262,9 @@ def delete_keypoints(video_id: int) -> str:
 
 
 def _zipped(path: Path, copy: Path) -> Path:
-    """Write a folder as a zip whose bytes depend on its files' names and contents only."""
-    with zipfile.ZipFile(copy, "w") as archive:
-        for file in sorted(f for f in path.iterdir() if f.suffix.lower() in (".csv", ".json") and f.is_file()):
-            member = zipfile.ZipInfo(file.name)
-            member.compress_type = zipfile.ZIP_DEFLATED
-            with file.open("rb") as source, archive.open(member, "w") as target:
-                shutil.copyfileobj(source, target)
-    return copy
+    """Write the tables of a phone's log as a zip."""
+    names = [f.name for f in path.iterdir() if f.suffix.lower() in (".csv", ".json") and f.is_file()]
+    return zipped(path, copy, names, zipfile.ZIP_DEFLATED)
 
 
 def _check_there(path: Path) -> None:

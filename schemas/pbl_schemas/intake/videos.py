@@ -188,6 +188,9 @@ class OneCamera(Recording):
                 next_step="name the file with --markers",
                 key=path,
             )
+        if self.sensors.depth is not None and fit.trials_of([number]):
+            found = f"--depth for one of several cameras, video_id {number}"
+            raise usage(found, "depths of a video of one camera", next_step="leave out --depth", key=path)
         if self.visit.camera_file is not None and fit.trials_of([number]):
             raise usage(
                 f"--camera for one of several cameras, video_id {number}",

@@ -1,0 +1,48 @@
+"""Files of a depth recording: in a folder, or in a zip, as the tables keep it and as Record3D writes it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from pbl_pipeline import bounded
+from pbl_pipeline.files import sha256_packed, zipped
+
+#: What is read of a folder.
+_READ = re.compile(r"((depth|confidence)/)?[^/]+\.(png|npy)|(odometry|camera_matrix|depth_matrix)\.csv", re.IGNORECASE)
+#: Bytes of an archive's directory: 65,535 members, which is all that one can have.
+_DIRECTORY = 8 * bounded.MIB
+#: Function from a file's path in a folder or a zip, and its most bytes, to its content. It raises OSError, ValueError,
+#: KeyError and `bounded.DAMAGED`.
+Get = Callable[[str, int], bytes]
+
+
+def names_in(path: Path) -> list[str]:
+    """Return the paths of the files in a folder or a zip. Raises OSError, ValueError as `bounded`."""
+    if path.is_dir():
+        found = (*path.glob("*"), *path.glob("*/*"))
+        return sorted(f.relative_to(path).as_posix() for f in found if f.is_file())
+    with bounded.opened_zip(path, _DIRECTORY) as archive:
+        return sorted(archive.namelist())
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Get]:
+    """Open a folder or a zip."""
+    if path.is_dir():
+        yield lambda name, most: bounded.read_bytes(path / name, most)
+        return
+    with bounded.opened_zip(path, _DIRECTORY) as archive:
+        yield lambda name, most: bytes(bounded.read_member(archive, archive.getinfo(name), most))
+
+
+def pack(folder: Path, copy: Path) -> Path:
+    """Write what is read of a folder as a zip, without its colour video."""
+    return zipped(folder, copy, [name for name in names_in(folder) if _READ.fullmatch(name)])
+
+
+def sha256_of_recording(path: Path) -> str:
+    """SHA-256 of a file, or of the zip of a folder (`pack`)."""
+    return sha256_packed(path, pack)
