@@ -22,15 +22,14 @@ from pbl_pipeline.gait import MEASURES, Z90, GaitCycle, load_norm, passes_of, sc
 from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
-    FOUND_VARIANCE,
     IMPORTANT_CHANGE,
+    RIDGE,
     MeasureError,
     MeasurementModel,
     Pass,
     View,
     chances,
     change_sd,
-    estimate,
     load_model,
     measure_error,
 )
@@ -42,15 +41,10 @@ from research.corpus.walks import ANYWHERE, HEALTHY, THERE_AND_BACK
 FAR_LEG = {"sagittal": RIGHT, "sagittal_right": LEFT, "frontal": "", "rear": "", "oblique": ""}
 MIRRORED = {"sagittal": "sagittal_right", "sagittal_right": "sagittal"}
 OTHER = {LEFT: RIGHT, RIGHT: LEFT, "": ""}
-#: How much a gain is drawn towards 1 (deg^2 of the scores' variance): of 30, 100 and 300, the one with the least mean
-#: square error of one pass of tuning persons who were left out in turn.
-RIDGE = 300.0
 #: Least variance (deg^2) of a pass' error in any direction.
 LEAST = 1.0
 #: Groups of persons who are left out in turn.
 FOLDS = 5
-#: Draws of the errors of a session's scores, each with its opposite (`variance_table`).
-VARIANCE_DRAWS = 128
 #: How a pass was fitted.
 ALONE, TOGETHER = "fitted alone", "fitted together"
 
@@ -614,42 +608,6 @@ def left_out_in_turn(seen: Sequence[Seen], sessions: Sequence[Seen], norm: Norma
     return pd.concat(frames)
 
 
-def variance_table(seen: Sequence[Seen], sessions: Sequence[Seen], norm: NormativeSet) -> pd.DataFrame:
-    """By kind of session of tuning persons, each by a model of what is seen of the others: how far the index of the
-    least-squares scores is from the true one, how far all of their stated variance would take it, `FOUND_VARIANCE` of
-    it, and the fraction that takes it as far as found, which is `gait.measurement.FOUND_VARIANCE`."""
-    people = sorted({s.person for s in seen})
-    rng, rows = np.random.default_rng(0), []
-    fractions = np.linspace(0.0, 1.5, 16)
-    for fold in range(FOLDS):
-        out = set(people[fold::FOLDS])
-        model = fit_model([s for s in seen if s.person not in out], norm, ())
-        # A person of whom nothing is known beforehand: the estimate is that of generalised least squares.
-        unknown = dataclasses.replace(model, spread=1e9 * np.eye(len(model.mean)))
-        for kind, _, recordings in sessions_of([s for s in sessions if s.person in out]):
-            scores = estimate(unknown, passes_of([c for s in recordings for c in s.cycles], norm))
-            true = np.mean([s.true for s in recordings], axis=0).ravel()
-            drawn = rng.multivariate_normal(np.zeros(len(true)), scores.covariance, VARIANCE_DRAWS, method="eigh")
-            errors = np.sqrt(fractions)[:, None, None] * np.concatenate([drawn, -drawn])
-            at = norm.index_of_scores((true + errors).reshape(*errors.shape[:2], 2, -1)).mean(axis=(1, 2))
-            found = norm.index_of_scores(scores.mean.reshape(2, -1)).mean()
-            rows.append({"session": kind, "found": found - at[0], **dict(enumerate(at - at[0]))})
-    frame = pd.DataFrame(rows)
-    means: Any = pd.concat(
-        [frame.groupby("session", sort=False).mean(), frame.drop(columns="session").mean().to_frame("all").T]
-    )
-    predicted = means[range(len(fractions))].to_numpy()
-    return pd.DataFrame(
-        {
-            "session": means.index,
-            "found": means["found"].to_numpy(),
-            "all of it": [np.interp(1.0, fractions, p) for p in predicted],
-            "FOUND_VARIANCE": [np.interp(FOUND_VARIANCE, fractions, p) for p in predicted],
-            "fraction": [np.interp(-f, -p, fractions) for f, p in zip(means["found"], predicted, strict=True)],
-        }
-    )
-
-
 def widening_of(judged_out: pd.DataFrame) -> float:
     """The factor of the sd with which 90 % of the intervals of persons left out in turn hold the truth."""
     return round(float(np.quantile(judged_out["ratio"], 0.9)) / Z90, 2)
@@ -712,9 +670,6 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
             models[fitted] = fit_model(own, basis, [method.hash], widening_of(out))
             click.echo(f"\n{fitted}: {len(own)} passes, {len(parts['held out', fitted])} held out")
             _echo_left_out(out, models[fitted].widening, people[1])
-            _echo(
-                "tuning persons left out in turn: uncorrected index less the true one", variance_table(own, own, basis)
-            )
             if fitted == TOGETHER:
                 click.echo("\nthe same by models of passes fitted alone")
                 out = left_out_in_turn(parts["tuning", ALONE], own, basis)
