@@ -2,7 +2,7 @@
 
     python -m research.benchmarks.same_walk                     # every recording; an hour on two cores
     python -m research.benchmarks.same_walk --clip demo
-    python -m research.benchmarks.same_walk --clip demo --params blazepose-measured --plain
+    python -m research.benchmarks.same_walk --clip demo --params blazepose-measured
 
 Each recording is encoded again mirrored, at half its size, in a tenth of its bytes, and cropped (8 % of each side, 4 %
 of top and bottom), and goes through the whole chain: people, keypoints, camera (not calibrated), the default fit,
@@ -12,9 +12,9 @@ there: sources and licences).
 
 Prints of each recording the index of every variant and its standard deviation where there is an index (two steps of a
 walk in view), and how far hip, knee and ankle angles are from those of the recording as it is (root mean square, deg;
-of the mirrored one with the sides exchanged), and below it the double support. Then the mean of the standard deviations
-over the recordings. Exit code 1 where that is over 1.5 points. `--plain` leaves out the measurement model of the index,
-which only the default fit has, so that fits can be compared.
+of the mirrored one with the sides exchanged); below it the index of the curves, without the measurement model that only
+the default fit has, and the double support. Then the mean of the standard deviations over the recordings. Exit code 1
+where that is over 1.5 points.
 """
 
 from __future__ import annotations
@@ -107,14 +107,14 @@ def keypoints_of(name: str, variant: str, folder: Path, method: str | None = Non
     return Keypoints.load(kept)
 
 
-def measured(fit: TrialFit, plain: bool) -> tuple[float, float]:
-    """Return index and double support (%) of one recording, NaN where it has none; `plain`: the index of the curves."""
+def measured(fit: TrialFit) -> tuple[float, float, float]:
+    """Return index, index of the curves and double support (%) of one recording, NaN where it has none."""
     found = gait_metrics([fit])
-    index, support = found.gdi, found.spatiotemporal.measures.get("double_support_percent")
-    if plain and index.mean is not None:
-        index = score_gdi([dataclasses.replace(c, error_model="") for c in found.cycles])
-    none = float("nan")
-    return none if index.mean is None else index.mean, none if support is None else support.mean
+    curves = score_gdi([dataclasses.replace(c, error_model="") for c in found.cycles])
+    support = found.spatiotemporal.measures.get("double_support_percent")
+    values = (found.gdi.mean, curves.mean, support and support.mean)
+    index, of_curves, percent = (float("nan") if v is None else float(v) for v in values)
+    return index, of_curves, percent
 
 
 def spread_of(values: Sequence[float]) -> float:
@@ -141,8 +141,7 @@ def angles_apart(first: TrialFit, other: TrialFit, sides_exchanged: bool) -> flo
 @click.option("--clip", "clips", multiple=True, help="Name of a recording; all of them where none is named.")
 @click.option("--params", default=METHODS.default, show_default=True, help="Name of a paramset.")
 @click.option("--method", help="Of the keypoints; default: the project's.")
-@click.option("--plain", is_flag=True, help="The index of the curves, without a measurement model.")
-def main(folder: Path, clips: Sequence[str], params: str, method: str | None, plain: bool) -> None:
+def main(folder: Path, clips: Sequence[str], params: str, method: str | None) -> None:
     """Print index and angles of every variant; exit code 1 where the index spreads by more than the bar."""
     spreads = []
     click.echo(f"{'':10}" + "".join(f"{v:>16}" for v in VARIANTS) + f"{'sd':>7}")
@@ -152,16 +151,16 @@ def main(folder: Path, clips: Sequence[str], params: str, method: str | None, pl
             try:
                 fit = fitted(name, keypoints_of(name, variant, folder, method), METHODS.find(params))
             except PblError as error:
-                cells.append((f"{error.code:>16}", f"{'':16}"))
+                cells.append((f"{error.code:>16}", *[" " * 16] * 2))
                 continue
             first = first or fit
-            found.append(measured(fit, plain))
-            index, support = found[-1]
+            found.append(measured(fit))
+            index, of_curves, support = found[-1]
             apart = angles_apart(first, fit, variant == "mirrored")
-            cells.append((f"{index:8.1f} {apart:4.1f} deg", f"{support:14.1f} %"))
-        for i, title in enumerate((name, "")):
+            cells.append((f"{index:8.1f} {apart:4.1f} deg", f"{of_curves:8.1f}{'':8}", f"{support:14.1f} %"))
+        for i, title in enumerate((name, "  curves", "  support")):
             click.echo(f"{title:10}" + "".join(c[i] for c in cells) + f"{spread_of([f[i] for f in found]):7.2f}")
-        spreads.append(spread_of([index for index, _ in found]))
+        spreads.append(spread_of([f[0] for f in found]))
     known = [s for s in spreads if np.isfinite(s)]
     if not known:
         click.echo("no recording has an index")
