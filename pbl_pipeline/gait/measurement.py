@@ -278,21 +278,18 @@ def unshrunk_index(
     turn = np.linalg.solve(model.spread, slip.T)
     errors = _drawn(covariance - slip @ turn, N_PEOPLE, 3)
 
-    def index(scores: np.ndarray) -> np.ndarray:
-        return _index(scores, norm).mean(axis=-1)
-
     def found(true: np.ndarray) -> np.ndarray:
-        return index(true + (true - model.mean) @ turn + errors)
+        return _index(true + (true - model.mean) @ turn + errors, norm).mean(axis=-1)
 
     people = model.mean + _drawn(model.spread, N_PEOPLE, 2)
-    true = index(people)
+    true = _index(people, norm).mean(axis=-1)
     line = np.linalg.solve(_bent(true) @ _bent(found(people)).T, _bent(true) @ true)
     likely = estimate(model, passes)
     alike = likely.mean + _drawn(likely.covariance, N_PEOPLE, 4)
-    sd = model.widening * float(np.std(line @ _bent(found(alike)) - index(alike)))
+    sd = model.widening * float(np.std(line @ _bent(found(alike)) - _index(alike, norm).mean(axis=-1)))
     if not sd <= MOST_UNSURE:
         return None, None
-    return float(line @ _bent(index(model.mean + covariance @ (weighed.T @ off)))), sd
+    return float(line @ _bent(_index(model.mean + covariance @ (weighed.T @ off), norm).mean(axis=-1))), sd
 
 
 def _bent(index: np.ndarray) -> np.ndarray:
@@ -378,8 +375,7 @@ def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: Normati
 
 def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
     """Covariance (2K, 2K) that a pass with fewer cycles than the measured ones has in addition."""
-    more = [max(0.0, 1.0 / max(n, 1) - 1.0 / model.n_cycles) for n in seen.n_cycles]
-    return _blocks(m * model.cycle for m in more)
+    return _blocks(max(0.0, 1.0 / max(n, 1) - 1.0 / model.n_cycles) * model.cycle for n in seen.n_cycles)
 
 
 def _doubted(seen: Pass) -> np.ndarray:
