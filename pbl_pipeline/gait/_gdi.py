@@ -93,11 +93,12 @@ MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MO
 #: to 0.4, adduction -0.9 to 0.2. `lengthening` is the one of 0, 0.05, 0.1 ... with which the index and its change
 #: between two visits err least with 33 points on these persons (the sum of both mean squares); version 4 had 0.2.
 #: Version 6 takes the measured model of the error where there is one; these constants serve where there is none.
-#: Version 7: a direction of walking is one pass, at whatever angle it is seen; passes that disagree count less.
+#: Version 7: a direction of walking is one pass, at whatever angle it is seen; passes that disagree count less. Version
+#: 8: the unshrunk index takes the errors as dependent on the true scores (before: 0.7 of their variance, independent).
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
 GDI_METHODS.register(
     GDI_MODEL,
-    7,
+    8,
     GdiParams(average="passes", lasting=0.5, both_sides=0.25, lengthening=0.05),
     "pbl_pipeline.gait:score_gdi",
 )

@@ -2,6 +2,7 @@
 
     python -m research.benchmarks.same_walk                     # every recording; an hour on two cores
     python -m research.benchmarks.same_walk --clip demo
+    python -m research.benchmarks.same_walk --clip demo --params blazepose-measured
 
 Each recording is encoded again mirrored, at half its size, in a tenth of its bytes, and cropped (8 % of each side, 4 %
 of top and bottom), and goes through the whole chain: people, keypoints, camera (not calibrated), the default fit,
@@ -11,12 +12,14 @@ there: sources and licences).
 
 Prints of each recording the index of every variant and its standard deviation where there is an index (two steps of a
 walk in view), and how far hip, knee and ankle angles are from those of the recording as it is (root mean square, deg;
-of the mirrored one with the sides exchanged). Then the mean of the standard deviations over the recordings. Exit code 1
+of the mirrored one with the sides exchanged); below it the index of the curves, without the measurement model that only
+the default fit has, and the double support. Then the mean of the standard deviations over the recordings. Exit code 1
 where that is over 1.5 points.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -28,10 +31,11 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, TrialFit
+from pbl_pipeline.gait import gait_metrics, score_gdi
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import read_frames
-from research.benchmarks.picture_size import fitted, index_of, keypoints_option, videos
+from research.benchmarks.picture_size import fitted, keypoints_option, videos
 from research.benchmarks.real_clips import fitted_angles
 from research.clip_keypoints import clip_keypoints
 from tests.videos import write_video
@@ -103,6 +107,22 @@ def keypoints_of(name: str, variant: str, folder: Path, method: str | None = Non
     return Keypoints.load(kept)
 
 
+def measured(fit: TrialFit) -> tuple[float, float, float]:
+    """Return index, index of the curves and double support (%) of one recording, NaN where it has none."""
+    found = gait_metrics([fit])
+    curves = score_gdi([dataclasses.replace(c, error_model="") for c in found.cycles])
+    support = found.spatiotemporal.measures.get("double_support_percent")
+    values = (found.gdi.mean, curves.mean, support and support.mean)
+    index, of_curves, percent = (float("nan") if v is None else float(v) for v in values)
+    return index, of_curves, percent
+
+
+def spread_of(values: Sequence[float]) -> float:
+    """Return the standard deviation of the values that are there: one that is withheld does not spread."""
+    shown = [v for v in values if np.isfinite(v)]
+    return float(np.std(shown, ddof=1)) if len(shown) > 1 else float("nan")
+
+
 def angles_apart(first: TrialFit, other: TrialFit, sides_exchanged: bool) -> float:
     """Root mean square of the differences of `ANGLES` (deg) over both sides and the frames that both fits have."""
     (time, angles), (other_time, other_angles) = fitted_angles(first), fitted_angles(other)
@@ -126,20 +146,21 @@ def main(folder: Path, clips: Sequence[str], params: str, method: str | None) ->
     spreads = []
     click.echo(f"{'':10}" + "".join(f"{v:>16}" for v in VARIANTS) + f"{'sd':>7}")
     for name in clips or videos():
-        cells, indices, first = [], [], None
+        cells, found, first = [], [], None
         for variant in VARIANTS:
             try:
                 fit = fitted(name, keypoints_of(name, variant, folder, method), METHODS.find(params))
             except PblError as error:
-                cells.append(f"{error.code:>16}")
+                cells.append((f"{error.code:>16}", *[" " * 16] * 2))
                 continue
             first = first or fit
-            indices.append(index_of(fit))
-            cells.append(f"{indices[-1]:8.1f} {angles_apart(first, fit, variant == 'mirrored'):4.1f} deg")
-        shown = [i for i in indices if np.isfinite(i)]  # an index that is withheld does not spread
-        spread = float(np.std(shown, ddof=1)) if len(shown) > 1 else float("nan")
-        spreads.append(spread)
-        click.echo(f"{name:10}" + "".join(f"{c:>16}" for c in cells) + f"{spread:7.2f}")
+            found.append(measured(fit))
+            index, of_curves, support = found[-1]
+            apart = angles_apart(first, fit, variant == "mirrored")
+            cells.append((f"{index:8.1f} {apart:4.1f} deg", f"{of_curves:8.1f}{'':8}", f"{support:14.1f} %"))
+        for i, title in enumerate((name, "  curves", "  support")):
+            click.echo(f"{title:10}" + "".join(c[i] for c in cells) + f"{spread_of([f[i] for f in found]):7.2f}")
+        spreads.append(spread_of([f[0] for f in found]))
     known = [s for s in spreads if np.isfinite(s)]
     if not known:
         click.echo("no recording has an index")

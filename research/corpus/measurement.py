@@ -23,6 +23,7 @@ from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
     IMPORTANT_CHANGE,
+    RIDGE,
     MeasureError,
     MeasurementModel,
     Pass,
@@ -40,9 +41,6 @@ from research.corpus.walks import ANYWHERE, HEALTHY, THERE_AND_BACK
 FAR_LEG = {"sagittal": RIGHT, "sagittal_right": LEFT, "frontal": "", "rear": "", "oblique": ""}
 MIRRORED = {"sagittal": "sagittal_right", "sagittal_right": "sagittal"}
 OTHER = {LEFT: RIGHT, RIGHT: LEFT, "": ""}
-#: How much a gain is drawn towards 1 (deg^2 of the scores' variance): of 30, 100 and 300, the one with the least mean
-#: square error of one pass of tuning persons who were left out in turn.
-RIDGE = 300.0
 #: Least variance (deg^2) of a pass' error in any direction.
 LEAST = 1.0
 #: Groups of persons who are left out in turn.

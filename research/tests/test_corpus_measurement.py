@@ -9,6 +9,7 @@ import pytest
 
 from pbl_pipeline import shipped as shipped_files
 from pbl_pipeline.gait import MEASURES, change_sd, measurement
+from research.corpus.found_variance import found_variance
 from research.corpus.measurement import (
     Seen,
     angle_errors,
@@ -139,3 +140,15 @@ def test_a_file_cut_in_the_middle_of_writing_does_not_count(tmp_path: Path, monk
     assert meanwhile == list(tmp_path.iterdir()) == []
     save_rows(tmp_path / "passes-0.npz", [{"n": 1}])
     assert [p.name for p in tmp_path.iterdir()] == ["passes-0.npz"]
+
+
+def test_what_the_errors_of_one_pass_add_to_the_scores():
+    """Least-squares scores of one pass have the inverse of the gain; the covariance of error and score is that of ridge
+    regression."""
+    model = measurement.load_model("blazepose-heat-maps")
+    view = model.views["left"]
+    inverse = np.linalg.inv(view.gain)
+    stated, longer = found_variance(model, ("left",))
+    error = model.person + model.visit + view.view + view.anew
+    assert stated == pytest.approx(np.trace(inverse @ error @ inverse.T))
+    assert longer - stated == pytest.approx(2.0 * measurement.RIDGE * np.trace(np.eye(len(inverse)) - inverse))

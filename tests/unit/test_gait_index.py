@@ -231,7 +231,7 @@ def test_the_papers_index_is_the_mean_over_all_steps_with_nothing_taken_back():
 
 def test_paramsets():
     assert {name: p.version for name, p in GDI_METHODS.items()} == {
-        GDI_MODEL: 7,
+        GDI_MODEL: 8,
         GILLETTE_MODEL: 1,
         PAPER_INDEX: 1,
     }

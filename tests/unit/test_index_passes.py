@@ -20,7 +20,7 @@ from pbl_pipeline.gait import (
     pool_trials,
     score_gdi,
 )
-from pbl_pipeline.gait.measurement import load_model
+from pbl_pipeline.gait.measurement import RIDGE, load_model
 from tests import Limits, not_none
 
 NORM, MODEL = load_norm(), load_model("blazepose-33")
@@ -36,10 +36,11 @@ def root(covariance: np.ndarray) -> np.ndarray:
 
 
 class Person:
-    """Someone drawn from the model: true scores, and the errors that their passes have in common."""
+    """Someone drawn from the model: true scores, and the errors that their passes have in common. `ridge`: how much
+    ridge regression drew the model's gains towards 1; what it left of them is in its errors."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
+    def __init__(self, rng: np.random.Generator, ridge: float = 0.0) -> None:
+        self.rng, self.ridge = rng, ridge
         self.true = MODEL.mean + self._drawn(MODEL.spread)
         self.own = self._drawn(MODEL.person)
         self.of_view = {k: self._drawn(v.view) for k, v in MODEL.views.items()}
@@ -56,8 +57,9 @@ class Person:
     ) -> list[GaitCycle]:
         """Return the cycles of a pass; `far_legs`: of each of them (default: the view's); `off`: of all scores."""
         v = MODEL.views[view]
-        mean = MODEL.mean + v.bias + v.gain @ (self.true - MODEL.mean) + self.own + self.of_view[view]
-        sides = np.reshape(mean + self._drawn(v.anew), (2, -1)) + off
+        left = self.ridge * np.linalg.solve(MODEL.spread, (v.gain - np.eye(SIZE)).T).T
+        mean = MODEL.mean + v.bias + (v.gain + left) @ (self.true - MODEL.mean) + self.own + self.of_view[view]
+        sides = np.reshape(mean + self._drawn(v.anew - left @ MODEL.spread @ left.T), (2, -1)) + off
         spread = [self.rng.standard_normal((N, SIZE // 2)) @ root(MODEL.cycle).T for _ in sides]
         scores = [s + e - e.mean(axis=0) for s, e in zip(sides, spread, strict=True)]
         far_legs = far_legs or [view] * (2 * N)
@@ -186,17 +188,19 @@ def test_names_and_order_change_nothing():
         assert again == pytest.approx(first, abs=1e-6), names
 
 
-def test_the_unshrunk_index_hears_a_person_whole(limits: Limits):
-    """Of the true differences of people it finds all where the index finds a part, and states its error. In the world
-    of the model all of the stated variance is there."""
-    limits("pbl_pipeline.gait.measurement", FOUND_VARIANCE=1.0)
+@pytest.mark.parametrize("ridge", [0.0, RIDGE])
+def test_the_unshrunk_index_hears_a_person_whole(ridge: float, limits: Limits):
+    """Of the true differences of people it finds all where the index finds a part, and states its error: where errors
+    do not depend on the true scores, and where the model's gains were drawn towards 1."""
+    limits("pbl_pipeline.gait.measurement", RIDGE=ridge)
     rng, rows = np.random.default_rng(6), []
     for _ in range(200):
-        person = Person(rng)
+        person = Person(rng, ridge)
         found = score_gdi(person.walks("a", "left") + person.walks("b", "right"))
         rows.append((person.index, not_none(found.mean), not_none(found.unshrunk), not_none(found.unshrunk_sd)))
     true, index, unshrunk, sd = np.array(rows).T
     assert np.polyfit(true, index, 1)[0] < 0.8
+    assert np.mean(unshrunk - true) == pytest.approx(0.0, abs=1.2)
     assert np.polyfit(true, unshrunk, 1)[0] == pytest.approx(1.0, abs=0.1)
     assert np.std(unshrunk - true) / np.mean(sd / MODEL.widening) == pytest.approx(1.0, abs=0.15)
     plain = score_gdi([dataclasses.replace(c, error_model="") for c in Person(rng).walks("a", "left")])

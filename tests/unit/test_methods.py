@@ -36,7 +36,7 @@ SHIPPED = {
     ("gait", "phase-transformer", 3): "74a0da658354ff09",
     ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",
     ("gait", "oconnor-2007", 2): "818ff933a9a6365a",
-    ("gdi", "pbl-2025-three-angles", 7): "e579079f0dcd0e5c",
+    ("gdi", "pbl-2025-three-angles", 8): "50a2abbdda89c85d",
     ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
     ("gdi", "paper-2025", 1): "a51bf145c1179652",
     ("kinetics", "newton-euler", 5): "d299a6ce470641b0",

@@ -183,7 +183,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
 @validate.command(
     epilog="\b\nExample: pbl validate bridge blazepose gauss-newton --keep bridge\n"
     "Example: pbl validate bridge of_0.2/blazepose-v7 blazepose\n"
-    "Example: pbl validate bridge pbl-2025-three-angles-v6 pbl-2025-three-angles-v7 --tables"
+    "Example: pbl validate bridge pbl-2025-three-angles-v7 pbl-2025-three-angles-v8 --tables"
 )
 @click.argument("old")
 @click.argument("new", required=False)
