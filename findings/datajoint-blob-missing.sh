@@ -5,9 +5,8 @@
 # Behaviour: the blob codec packs a masked array without its mask; a missing float comes back as 1e20, a missing whole
 #   number as 999999. A datetime with a zone comes back with the same hour and no zone. Types that it cannot hold, such as
 #   float16 or a timedelta, it refuses.
-# Matters: readers of netCDF return masked arrays, and programs that mark lost markers often do. Means of
-#   what was fetched are then of the order of 1e20. Store `array.filled(nan)`, and
-#   times in UTC.
+# Matters: the package netCDF4 returns masked arrays, and programs that mark lost samples may. Means of what
+#   was fetched are then of the order of 1e20. Store `array.filled(nan)`, and times in UTC.
 
 # shellcheck disable=SC1091 # _common.sh is checked by itself
 source "$(dirname "${BASH_SOURCE[0]}")/_common.sh"

@@ -46,13 +46,13 @@ import sleap_io
 logging.disable()
 
 
-def read(plugin=None):
-    video = sleap_io.load_video("phone.mp4", plugin=plugin)
+def read(**choice):
+    video = sleap_io.load_video("phone.mp4", **choice)
     numbers = [round(float(video[i].mean()) / 6) for i in range(len(video))]
     print(f"{video.backend.plugin}: {len(video)} frames of {video.shape[2]} x {video.shape[1]}:", *numbers)
 PY
 observe venv <<<'import read; read.read()'
-observe venv <<<'import read; read.read("pyav")'
+observe venv <<<'import read; read.read(plugin="pyav")'
 install opencv-python-headless==5.0.0.93
 observe venv <<<'import read; read.read()'
 expect <<'SEEN'
