@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# In ahrs an orientation has other roll, pitch and yaw as a matrix than as a quaternion; a power of it is no rotation.
+# In ahrs an orientation has other roll, pitch and yaw as a matrix than as a quaternion; its power is not a rotation.
 #
 # Seen 2026-11-29: ahrs 0.4.0, numpy 2.4.6.
 # Behaviour: `Quaternion.to_angles` and `q2rpy` return the angles that the quaternion was made of. `DCM(q=...).to_rpy` and

@@ -22,7 +22,7 @@ import jax
 import mujoco
 import numpy as np
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that there is no package for NVIDIA's Warp
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that NVIDIA's Warp is missing
     from mujoco import mjx
 
 jax.config.update("jax_enable_x64", True)

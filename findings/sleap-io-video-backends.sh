@@ -4,8 +4,8 @@
 # Seen 2026-11-29: sleap-io 0.9.5, imageio-ffmpeg 0.8.1, opencv-python-headless 5.0.0.93, av 15.1.0.
 # Behaviour: a phone's video has frames at uneven times, and a note that it is to be turned. sleap-io as pip installs it
 #   reads it through imageio-ffmpeg: where a frame lasts longer it is returned again, and as many of the last ones never;
-#   the number of frames is right. With OpenCV beside it, which it then takes, frame i is the i-th picture. With PyAV it
-#   is, too, but the picture is not turned. No error or warning.
+#   the number of frames is right. With OpenCV beside it, which it then takes, frame i is the i-th picture; with PyAV it
+#   also is, but the picture is not turned. No error or warning.
 # Matters: points that were labelled or predicted in SLEAP belong to other moments (here up to 0.2 s) or have x and y
 #   exchanged where the next program, or a colleague's installation, counts the frames of the same video.
 
