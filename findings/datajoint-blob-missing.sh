@@ -3,8 +3,8 @@
 #
 # Seen 2026-11-29: datajoint 2.3.5, numpy 2.4.6.
 # Behaviour: the blob codec packs a masked array without its mask; a missing float comes back as 1e20, a missing whole
-#   number as 999999. A datetime with a zone comes back with the same hour and no zone. Types that it cannot hold, such as
-#   float16 or a timedelta, it refuses.
+#   number as 999999. A datetime with a zone comes back with the same hour and no zone. Types such as float16
+#   and timedelta are refused.
 # Matters: the package netCDF4 returns masked arrays, and programs that mark lost samples may. Means of what
 #   was fetched are then of the order of 1e20. Store `array.filled(nan)`, and times in UTC.
 

@@ -6,7 +6,7 @@
 #   reads it through imageio-ffmpeg: where a frame lasts longer it is returned again, and as many of the last ones never;
 #   the number of frames is right. With OpenCV beside it, which it then takes, frame i is the i-th picture; with PyAV it
 #   also is, but the picture is not turned. No error or warning.
-# Matters: points that were labelled or predicted in SLEAP belong to other moments (here up to 0.2 s) or have x and y
+# Matters: points that were labelled or predicted in SLEAP belong to other moments (here up to 0.3 s) or have x and y
 #   exchanged where the next program, or a colleague's installation, counts the frames of the same video.
 
 # shellcheck disable=SC1091 # _common.sh is checked by itself
