@@ -189,6 +189,7 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         loss_trace=solution.loss_trace,
         iterations=solution.iterations,
         converged=solution.converged,
+        result=solution.result.name.lower(),
         solver=str(paramset.params["solver"]),
         params_hash=paramset.hash,
         seconds=seconds,

@@ -42,6 +42,29 @@ class PersonTrack:
 
 
 @record
+class KeypointFigures:
+    """Keypoints of the measured person in figures."""
+
+    marker_set: str = column("marker_set", "names and places of the points", "varchar(32)")
+    n_points: int = column("n_points", "points of the marker set", "int16")
+    root_relative: bool = column("root_relative", "whether 3D points are relative to the root of the body", "bool")
+    n_seen: int = column("n_seen", "frames with at least one point", "int32")
+    median_confidence: float = column(
+        "median_confidence", "(0..1) median over the points that were seen, null when none was", null=True
+    )
+    camera_kind: str = column(
+        "camera_kind",
+        "where the intrinsics come from",
+        "enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')",
+    )
+    camera_source: str = column("camera_source", "the same in words", "varchar(255)", cut=True)
+    focal_px: float = column("focal_length", "(px) mean of fx and fy")
+    focal_rel_sd: float = column(
+        "focal_rel_sd", "(1) standard deviation of the focal length as a share of it, null when unknown", null=True
+    )
+
+
+@record
 class SubjectChoice:
     """Choice of the person to measure."""
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import from_row, number
+from pbl_pipeline.records import definition, from_row, to_row
+from pbl_pipeline.results.people import KeypointFigures
 from pbl_pipeline.results.video_facts import Intrinsics
 from pbl_pipeline.temporary import new_folder
 
@@ -56,15 +57,7 @@ class Keypoints(dj.Computed):
     -> KeypointSelection
     ---
     keypoints_person_id   : int16              # number of the measured person in the tracking
-    marker_set            : varchar(32)        # names and places of the points
-    n_points              : int16              # points of the marker set
-    root_relative         : bool               # whether 3D points are relative to the root of the body
-    n_seen                : int32              # frames with at least one point
-    median_confidence=null: float64            # (0..1) median over the points that were seen, null when none was
-    camera_kind           : enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')  # where the intrinsics come from
-    camera_source         : varchar(255)       # the same in words
-    focal_length          : float64            # (px) mean of fx and fy
-    focal_rel_sd=null     : float64            # (1) standard deviation of the focal length as a share of it, null when unknown
+    {definition(KeypointFigures)}
     keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
     phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
@@ -143,22 +136,13 @@ class Keypoints(dj.Computed):
         camera_id: int | None,
         origin: Origin,
     ) -> None:
-        seen = found.confidence > 0
         with new_folder() as folder:
             found.save(folder / "keypoints.npz")
             self.insert1(
                 {
                     **key,
                     "keypoints_person_id": person,
-                    "marker_set": found.marker_set,
-                    "n_points": len(found.names),
-                    "root_relative": found.root_relative,
-                    "n_seen": int(seen.any(axis=1).sum()),
-                    "median_confidence": number(np.median(found.confidence[seen])) if seen.any() else None,
-                    "camera_kind": found.camera.kind,
-                    "camera_source": found.camera.source[:255],
-                    "focal_length": found.camera.focal_px,
-                    "focal_rel_sd": number(found.camera.focal_rel_sd),
+                    **to_row(found.figures),
                     "keypoints_camera_id": camera_id,
                     "phone_log": None if log is None else log[:255],
                     "keypoints_file": folder / "keypoints.npz",
