@@ -33,7 +33,7 @@ class Solution:
     software: str = ""  # version and commit of the code
     result: str | None = column(
         "fit_result",
-        "why the solver ended: small_step, small_gain or max_steps_reached; null for fits of before it was recorded",
+        "why the solver ended: small_step, small_gain or max_steps_reached; null: not recorded",
         "varchar(32)",
         before="scale",
         default=None,
