@@ -83,6 +83,21 @@ class TrialMetrics(TrialCycles):
     qc: tuple[Check, ...]
     pooled: bool = True
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        events: GaitEvents,
+        cycles: Sequence[GaitCycle],
+        measures: Spatiotemporal,
+        gdi: Gdi,
+        pooled: bool,
+    ) -> TrialMetrics:
+        """Return these results of a trial with its status and its checks."""
+        reason, checks = events.reason or measures.reason, (*events.qc, *cycle_checks(measures, cycles), *gdi.qc)
+        status = EMPTY if reason else PASS
+        return cls(name, reason, tuple(cycles), status, events, measures, gdi, checks, pooled)
+
     def to_dict(self) -> dict:
         """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
         of_files = ("trial", "curves", "curves_sd", "error_model")
@@ -302,18 +317,7 @@ def _trial(
         if condition.activity in TASK_MEASURES:
             task = task_measures(task_motion(trial, poses), condition.activity, fit_checks)
     measures, gdi = spatiotemporal(cycles).with_task(*task), score_gdi(cycles, **index)
-    reason = events.reason or measures.reason
-    return TrialMetrics(
-        name=trial.name,
-        reason=reason,
-        cycles=cycles,
-        status=EMPTY if reason else PASS,
-        events=events,
-        spatiotemporal=measures,
-        gdi=gdi,
-        qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
-        pooled=condition.pooled(index["params"].pace),
-    )
+    return TrialMetrics.of(trial.name, events, cycles, measures, gdi, condition.pooled(index["params"].pace))
 
 
 def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:

@@ -51,7 +51,7 @@ from .origin import Origin, computes, origin_columns
 from .plan import plan_fit_sets
 from .record_parts import part_of
 from .rows import InputChanged, MadeOnce, delete_below, inside, one
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib
@@ -319,8 +319,7 @@ def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:
     """Return the library's `TrialFit` in a file of the store."""
     from pbl_pipeline.fit import TrialFit
 
-    with stored_file(ref) as path:
-        return TrialFit.load(path)
+    return read_stored(ref, TrialFit.load)
 
 
 def trial_key(video_id: int) -> dict[str, Any] | None:

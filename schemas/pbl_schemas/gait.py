@@ -24,7 +24,7 @@ from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .review import Decision
 from .rows import Rows, one, row_of, stored_rows
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait.metrics_file import Curves
@@ -333,6 +333,5 @@ def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], tr
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
     from pbl_pipeline.gait.metrics_file import load_curves
 
-    with stored_file(ref) as path:
-        curves = load_curves(path)
+    curves = read_stored(ref, load_curves)
     return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]

@@ -21,7 +21,7 @@ from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import one
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import keypoints as lib
@@ -73,17 +73,15 @@ class Keypoints(dj.Computed):
         return tracking.chosen().proj() * KeypointSelection.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
-        probed = one(video.Video * video.VideoInfo & key)
-        times = file_ref(probed.pop("frame_time"))
+        probed, times = video.probed(key)
         person = one(tracking.chosen() & key, "chosen_person_id")
-        tracks, detector, model = one(tracking.Tracking & key, "tracks", "detector", "tracking_model_sha256")
         camera = video.camera_of(probed)
         log = (video.PhoneAttitude & key).to_dicts()
         return (
             probed,
             times,
             int(person),
-            (file_ref(tracks), detector, model),
+            tracking.tracks_of(key),
             camera,
             (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
             method_row(KeypointMethod, key),
@@ -104,16 +102,12 @@ class Keypoints(dj.Computed):
         from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
         from pbl_pipeline.video import attitude_of, check_timing, find_camera, read_phone_log
 
-        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
+        path, info = video.read_probed(probed, times, key)
         detector = methods.stored(**method)
-        with stored_file(times) as stored:
-            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
         if log is not None:
-            with stored_file(log[1]) as stored:
-                attitude = attitude_of(read_phone_log(stored), Path(log[0]), info)
-        with stored_file(tracks[0]) as stored:
-            everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
+            attitude = attitude_of(read_stored(log[1], read_phone_log), Path(log[0]), info)
+        everybody = tracking.load_tracking(*tracks)
         view = camera_of_row(camera) if camera else find_camera(info)
         found = detect_keypoints(path, everybody, person, view, params=detector)
         if attitude is not None:

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
@@ -17,7 +15,6 @@ from pbl_pipeline.temporary import TemporaryFolder, new_folder
 from . import video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -55,8 +52,7 @@ class Deidentified(dj.Computed):
         return video.VideoInfo.proj() & self.wanted()
 
     def make_fetch(self, key: dict) -> tuple:
-        probed = one(video.Video * video.VideoInfo & key)
-        return probed, file_ref(probed.pop("frame_time"))
+        return video.probed(key)
 
     @computes
     def make_compute(
@@ -72,9 +68,7 @@ class Deidentified(dj.Computed):
                 expected="blur, pixelate or skeleton",
                 next_step="set it as on the machine that queued the job, then `pbl retry`",
             )
-        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        with stored_file(times) as stored:
-            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
+        path, info = video.read_probed(probed, times, key)
         folder = new_folder()
         done = deidentify(path, folder.path / "deidentified.mp4", how, info=info)
         return done, folder, sha256_of(done.path)

@@ -13,7 +13,7 @@ from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import one, or_nan
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib
@@ -78,9 +78,7 @@ class KinematicError(dj.Computed):
     ) -> tuple[lib.KinematicErrors]:
         from pbl_pipeline import validation as lib
 
-        with stored_file(reference) as path:
-            truth = lib.Reference.load(path)
-        return (lib.compare(fit.load_trial(fitted), truth),)
+        return (lib.compare(fit.load_trial(fitted), read_stored(reference, lib.Reference.load)),)
 
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
         view = {f"error_view_{side}": seen for side, seen in errors.view.items()}
