@@ -63,7 +63,8 @@ class Tracking:
             rows = [getattr(p, name) for p in self.persons]
             tracks[name] = np.asarray(rows, bool if name == "observed" else np.float32).reshape(n, t, *rest)
         ids = np.asarray([p.person_id for p in self.persons], np.int16)
-        np.savez_compressed(path, time_s=np.asarray(self.time_s, np.float64), person_id=ids, **tracks)
+        arrays = {"time_s": np.asarray(self.time_s, np.float64), "person_id": ids, **tracks}
+        np.savez_compressed(path, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: Path, image_size_px: tuple[int, int], detector: str, model_sha256: str) -> Tracking:

@@ -329,10 +329,9 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
     return {k: rows[0][k] for k in SessionFit.Trial.primary_key} if rows else None
 
 
-def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
-    """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
-    found = SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
-    return [dataclasses.astuple(check) for check in found]
+def fit_checks(key: Mapping[str, Any]) -> list[Quality]:
+    """The checks of one session fit, by a key with its own."""
+    return SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:

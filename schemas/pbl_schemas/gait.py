@@ -207,14 +207,13 @@ class GaitCycle(dj.Computed):
         key: dict,
         events: Events,
         ref: dict,
-        checks: Sequence[tuple],
+        checks: Sequence[Quality],
         correction: Mapping[str, Any] | None,
         accepted: float | None,
     ) -> tuple[tuple[Cycle, ...], int | None]:
         from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
-        from pbl_pipeline.qc import Check
 
-        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=[Check(*check) for check in checks])
+        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=checks)
         if accepted is not None and refused_cadence(cycles) == accepted:
             cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
@@ -260,15 +259,14 @@ class Spatiotemporal(dj.Computed):
         rows: Sequence[Mapping[str, Any]],
         activity: str,
         ref: dict,
-        checks: Sequence[tuple],
+        checks: Sequence[Quality],
     ) -> tuple[Measures]:
         from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
-        from pbl_pipeline.qc import Check
 
         found = spatiotemporal([cycle_of_row(r, name) for r in rows])
         if activity in TASK_MEASURES:
             motion = task_motion(fit.load_trial(ref))
-            found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
+            found = found.with_task(*task_measures(motion, activity, checks))
         return (found,)
 
     def make_insert(self, key: dict, result: Measures, origin: Origin) -> None:
