@@ -188,7 +188,7 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         site_offset_m=solution.site_offset_m,
         loss_trace=solution.loss_trace,
         iterations=solution.iterations,
-        converged=solution.converged,
+        converged=solution.result.converged,
         result=solution.result.name.lower(),
         solver=str(paramset.params["solver"]),
         params_hash=paramset.hash,

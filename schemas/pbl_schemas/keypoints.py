@@ -74,18 +74,11 @@ class Keypoints(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         probed, times = video.probed(key)
-        person = one(tracking.chosen() & key, "chosen_person_id")
-        camera = video.camera_of(probed)
-        log = (video.PhoneAttitude & key).to_dicts()
-        return (
-            probed,
-            times,
-            int(person),
-            tracking.tracks_of(key),
-            camera,
-            (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
-            method_row(KeypointMethod, key),
-        )
+        person = int(one(tracking.chosen() & key, "chosen_person_id"))
+        logs = (video.PhoneAttitude & key).to_dicts()
+        log = (logs[0]["attitude_name"], file_ref(logs[0]["attitude_file"])) if logs else None
+        seen = person, tracking.tracks_of(key), video.camera_of(probed), log
+        return probed, times, *seen, method_row(KeypointMethod, key)
 
     @computes
     def make_compute(
