@@ -6,6 +6,10 @@ import numpy as np
 
 from pbl_pipeline.records import column, record
 
+from .video_facts import CAMERA_KINDS
+
+_KIND_TYPE = f"enum({', '.join(map(repr, CAMERA_KINDS))})"
+
 
 @record
 class TrackFigures:
@@ -52,11 +56,7 @@ class KeypointFigures:
     median_confidence: float = column(
         "median_confidence", "(0..1) median over the points that were seen, null when none was", null=True
     )
-    camera_kind: str = column(
-        "camera_kind",
-        "where the intrinsics come from",
-        "enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')",
-    )
+    camera_kind: str = column("camera_kind", "where the intrinsics come from", _KIND_TYPE)
     camera_source: str = column("camera_source", "the same in words", "varchar(255)", cut=True)
     focal_px: float = column("focal_length", "(px) mean of fx and fy")
     focal_rel_sd: float = column(

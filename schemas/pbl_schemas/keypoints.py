@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, from_row, to_row
@@ -143,8 +141,5 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     """The library's `Camera` from a row of CameraCalibration with `turn_deg` (`video.camera_of`)."""
     from pbl_pipeline.video import Camera, turned_camera
 
-    c = from_row(Intrinsics, row)
-    matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
-    rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
-    camera = Camera(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
-    return turned_camera(camera, (c.width_px, c.height_px), row["turn_deg"])
+    found = from_row(Intrinsics, row)
+    return turned_camera(Camera.of(found), (found.width_px, found.height_px), row["turn_deg"])
