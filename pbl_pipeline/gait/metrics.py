@@ -85,18 +85,11 @@ class TrialMetrics(TrialCycles):
 
     @classmethod
     def of(
-        cls,
-        name: str,
-        events: GaitEvents,
-        cycles: Sequence[GaitCycle],
-        measures: Spatiotemporal,
-        gdi: Gdi,
-        pooled: bool,
+        cls, name: str, events: GaitEvents, cycles: Sequence[GaitCycle], found: Spatiotemporal, gdi: Gdi, pooled: bool
     ) -> TrialMetrics:
         """Return these results of a trial with its status and its checks."""
-        reason, checks = events.reason or measures.reason, (*events.qc, *cycle_checks(measures, cycles), *gdi.qc)
-        status = EMPTY if reason else PASS
-        return cls(name, reason, tuple(cycles), status, events, measures, gdi, checks, pooled)
+        reason, checks = events.reason or found.reason, (*events.qc, *cycle_checks(found, cycles), *gdi.qc)
+        return cls(name, reason, tuple(cycles), EMPTY if reason else PASS, events, found, gdi, checks, pooled)
 
     def to_dict(self) -> dict:
         """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""

@@ -65,6 +65,24 @@ class KeypointFigures:
 
 
 @record
+class HiddenHeads:
+    """A video with hidden heads in figures."""
+
+    how: str = column(
+        "{}_how", "how heads are hidden; skeleton: keypoints on black", "enum('blur', 'pixelate', 'skeleton')"
+    )
+    status: str = column(
+        "{}_status",
+        "REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered",
+        "enum('CERTAIN', 'REVIEW', 'NO_HEAD')",
+    )
+    reason: str = column("{}_reason", "the status in words", "varchar(255)", cut=True)
+    n_heads: int = column("{}_heads", "heads that were found, false ones included", "int32")
+    n_uncertain: int = column("{}_uncertain", "frames that are not certain", "int32")
+    ranges: tuple[dict, ...] = column("{}_ranges", "runs of these: first and last frame (from 0), and why", "json")
+
+
+@record
 class SubjectChoice:
     """Choice of the person to measure."""
 

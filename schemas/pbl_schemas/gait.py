@@ -314,12 +314,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
     """The library's cycle of a row of GaitCycle.Cycle."""
     if row["cycle_length_ratio"] is not None and row["cycle_length_unproven"] is None:
         row = {**row, "cycle_length_unproven": True}  # older than the column: not known, so the spread is withheld
-    of_file = (
-        {"curves": dict(curves.deg), "curves_sd": dict(curves.sd_deg), "error_model": curves.error_model}
-        if curves
-        else {}
-    )
-    return from_row(Cycle, row, trial=trial, **of_file)
+    return from_row(Cycle, row, trial=trial, **({} if curves is None else curves._asdict()))
 
 
 def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[Cycle]:

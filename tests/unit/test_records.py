@@ -20,7 +20,7 @@ from pbl_pipeline.results.events import GaitEvent, GaitEvents, SetEvent
 from pbl_pipeline.results.fits import Residuals, TrialFigures
 from pbl_pipeline.results.index import NormFacts, VariableScore
 from pbl_pipeline.results.measures import Measure
-from pbl_pipeline.results.people import KeypointFigures, TrackFigures
+from pbl_pipeline.results.people import HiddenHeads, KeypointFigures, TrackFigures
 from pbl_pipeline.results.video_facts import Intrinsics
 
 
@@ -105,6 +105,7 @@ VALUES: dict[Any, Any] = {
     float: 1.5, int: 3, bool: True, np.ndarray: np.array([1.5, 2.5]), dict[int, float]: {2: 0.5},
     tuple[str, ...]: ("a",),
     tuple[tuple[float, float], ...]: ((0.5, 1.5),),
+    tuple[dict, ...]: ({"first": 0, "why": ["held"]},),
 }  # fmt: skip
 
 
@@ -131,7 +132,7 @@ def filled(cls: Any) -> Any:
 RESULTS = [c for c in vars(results).values() if isinstance(c, type) and dataclasses.is_dataclass(c) and declared(c)]
 
 
-OTHERS = [Check, SetEvent, NormFacts, Residuals, TrialFigures, Intrinsics, TrackFigures, KeypointFigures]
+OTHERS = [Check, SetEvent, NormFacts, Residuals, TrialFigures, Intrinsics, TrackFigures, KeypointFigures, HiddenHeads]
 
 
 @pytest.mark.parametrize("cls", [*RESULTS, *OTHERS])

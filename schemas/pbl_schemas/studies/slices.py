@@ -475,7 +475,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
             continue
         by_cycle = read_stored(file_ref(r["curves"]), load_curves)
         for n, side in sides.items():
-            for angle, curve in by_cycle[n].deg.items():
+            for angle, curve in by_cycle[n].curves.items():
                 found[r["fit_set"], side, angle].append(curve)
     out, points = [], []
     for (fit_set, side, angle), curves in found.items():
