@@ -20,6 +20,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import check_out_file, complete_file, sha256_of
 from pbl_pipeline.render import draw_skeleton
+from pbl_pipeline.results.people import HiddenHeads
 from pbl_pipeline.runs import ranges
 from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, write_h264
@@ -147,6 +148,12 @@ class Deidentified:
     @property
     def n_uncertain(self) -> int:
         return sum(bool(r) for r in self.reasons)
+
+    @property
+    def figures(self) -> HiddenHeads:
+        """The result in figures."""
+        runs = tuple({"first": a, "last": b, "why": self.why(a, b)} for a, b in self.uncertain)
+        return HiddenHeads(self.how, self.status, self.reason, self.n_heads, self.n_uncertain, runs)
 
 
 def sidecar_of(out: Path) -> Path:

@@ -339,7 +339,7 @@ def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
 def _converged(solution: Solution) -> Check:
     if solution.qpos_sd is not None:
         advice = "the solver stopped at its bound on steps, not at a minimum: look at the overlay, raise max_iterations"
-        return warn_if(not solution.converged, "iterations", float(solution.iterations), None, advice)
+        return warn_if(not solution.result.converged, "iterations", float(solution.iterations), None, advice)
     loss = solution.loss_trace[:, 1]
     enough = len(loss) >= TRACE_NEEDED
     fall = float(loss[len(loss) // 2 - 1] / loss[-1] - 1) if enough else None

@@ -151,7 +151,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         compile_seconds=compile_seconds,
         seconds=time.perf_counter() - begin,
         iterations=params.steps,
-        result=Result.SMALL_GAIN if ended else Result.BOUND,
+        result=Result.SMALL_GAIN if ended else Result.MAX_STEPS_REACHED,
         outcome=jax.device_get(_outcome(data, unknowns, jnp.asarray(qpos), jnp.asarray(R_nc))),
     )
 

@@ -198,7 +198,7 @@ def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: L
         for n in range(most + 1):  # the first one evaluates the start
             at = fit_one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
             update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
-            if int(at.result) != Result.BOUND:
+            if int(at.result) != Result.MAX_STEPS_REACHED:
                 break
     return at
 

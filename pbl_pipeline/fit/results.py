@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError, unread_file
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import from_json, plain, record
-from pbl_pipeline.results import DepthFit, SensorFit, Solution
+from pbl_pipeline.results.fits import DepthFit, Residuals, SensorFit, Solution, TrialFigures
 from pbl_pipeline.video import Camera, check_lens
 
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
@@ -87,6 +87,12 @@ class TrialFit:
     def observed_qpos(self) -> np.ndarray:
         """`qpos` (T, 40) with NaN for joints that were not observed: for all that gives out angles."""
         return np.where([n in self.not_observed for n in self.joint_names], np.nan, np.asarray(self.qpos, float))
+
+    @property
+    def figures(self) -> TrialFigures:
+        """The trial in figures."""
+        fitted, source = int(np.isfinite(self.qpos).all(axis=1).sum()), self.orientation_source
+        return TrialFigures(self.name, fitted, Residuals.of([self]), source, self.phone_clock_offset_s)
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""

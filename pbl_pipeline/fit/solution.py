@@ -62,11 +62,6 @@ class Solution:
     sensors: tuple[tuple[SensorFit, ...], ...] = ()
     depths: tuple[DepthFit | None, ...] = ()
 
-    @property
-    def converged(self) -> bool:
-        """True if the solver ended at a minimum."""
-        return self.result.converged
-
 
 def outcome(p: Problem, x: Float[Array, "F P 3"], R_nc: Float[Array, "F V 3 3"]) -> Outcome:
     """The outcome of fitted points and camera orientations."""

@@ -83,6 +83,14 @@ class TrialMetrics(TrialCycles):
     qc: tuple[Check, ...]
     pooled: bool = True
 
+    @classmethod
+    def of(
+        cls, name: str, events: GaitEvents, cycles: Sequence[GaitCycle], found: Spatiotemporal, gdi: Gdi, pooled: bool
+    ) -> TrialMetrics:
+        """Return these results of a trial with its status and its checks."""
+        reason, checks = events.reason or found.reason, (*events.qc, *cycle_checks(found, cycles), *gdi.qc)
+        return cls(name, reason, tuple(cycles), EMPTY if reason else PASS, events, found, gdi, checks, pooled)
+
     def to_dict(self) -> dict:
         """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
         of_files = ("trial", "curves", "curves_sd", "error_model")
@@ -302,18 +310,7 @@ def _trial(
         if condition.activity in TASK_MEASURES:
             task = task_measures(task_motion(trial, poses), condition.activity, fit_checks)
     measures, gdi = spatiotemporal(cycles).with_task(*task), score_gdi(cycles, **index)
-    reason = events.reason or measures.reason
-    return TrialMetrics(
-        name=trial.name,
-        reason=reason,
-        cycles=cycles,
-        status=EMPTY if reason else PASS,
-        events=events,
-        spatiotemporal=measures,
-        gdi=gdi,
-        qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
-        pooled=condition.pooled(index["params"].pace),
-    )
+    return TrialMetrics.of(trial.name, events, cycles, measures, gdi, condition.pooled(index["params"].pace))
 
 
 def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:

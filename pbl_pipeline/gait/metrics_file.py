@@ -23,11 +23,11 @@ from .tasks import TRIAL_MEASURES
 
 
 class Curves(NamedTuple):
-    """Known curves of one cycle and their standard deviations by name, each (P,) degrees, and the name of the model of
-    their error (`GaitCycle.error_model`)."""
+    """Fields of a `GaitCycle` in its file: known curves and their standard deviations by name, each (P,) degrees, and
+    the model of their error."""
 
-    deg: dict[str, np.ndarray]
-    sd_deg: dict[str, np.ndarray]
+    curves: dict[str, np.ndarray]
+    curves_sd: dict[str, np.ndarray]
     error_model: str = ""
 
 
@@ -148,8 +148,7 @@ def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
 
 def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
     known = curves.get(int(content["number"]), Curves({}, {}))
-    of_file = {"curves": known.deg, "curves_sd": known.sd_deg, "error_model": known.error_model}
-    return structured({**content, "trial": trial, **of_file}, GaitCycle)
+    return structured({**content, "trial": trial, **known._asdict()}, GaitCycle)
 
 
 def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:

@@ -13,6 +13,7 @@ import numpy as np
 from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
+from pbl_pipeline.results.people import KeypointFigures
 from pbl_pipeline.video import VIDEO_CLOCK, Attitude, Camera, PhoneLog, check_attitude, check_lens
 
 from .picture import Picture
@@ -120,6 +121,14 @@ class Keypoints:
         time_s, quat_wxyz = check_attitude(self.phone_time_s, self.phone_quat_wxyz)
         object.__setattr__(self, "phone_time_s", time_s)
         object.__setattr__(self, "phone_quat_wxyz", quat_wxyz)
+
+    @property
+    def figures(self) -> KeypointFigures:
+        """The keypoints in figures."""
+        seen, camera = self.confidence > 0, self.camera
+        median = float(np.median(self.confidence[seen])) if seen.any() else math.nan
+        points = (self.marker_set, len(self.names), self.root_relative, int(seen.any(axis=1).sum()), median)
+        return KeypointFigures(*points, camera.kind, camera.source, camera.focal_px, camera.focal_rel_sd)
 
     def with_attitude(self, attitude: Attitude) -> Keypoints:
         """Return the same keypoints with the phone's orientation."""

@@ -31,6 +31,13 @@ class Solution:
     compile_seconds: float = column("compile_seconds", "(s) of the duration, spent compiling")
     device: str = column("compute_device", "what JAX computed on", "varchar(64)")
     software: str = ""  # version and commit of the code
+    result: str | None = column(
+        "fit_result",
+        "why the solver ended: small_step, small_gain or max_steps_reached; null: not recorded",
+        "varchar(32)",
+        before="scale",
+        default=None,
+    )
 
     @property
     @stored("fit_loss", "(-) total loss at the end", before="iterations")
@@ -64,6 +71,24 @@ class DepthFit:
     z: float = column("depths_z", "(-) their error in standard deviations, root mean square", null=True)
     distance: float = column("depths_distance", "(-) distance of the fit without depths over theirs, of the visit")
     metre: float = column("depths_metre", "(-) metres of the fit in one of theirs, by which it is divided, of a visit")
+
+
+@record
+class TrialFigures:
+    """A fitted trial in figures."""
+
+    name: str = column("trial_name", type="varchar(255)", cut=True)
+    n_fitted: int = column("trial_n_fitted", "frames with joint angles", "int32")
+    residuals: Residuals
+    orientation: str = column(  # no enum: DataJoint 2.3.5 cannot read one back whose values hold a colon
+        "trial_orientation",
+        "where the vertical comes from, such as 'measured: phone', null where it was not recorded",
+        "varchar(32)",
+        null=True,
+    )
+    clock_offset_s: float = column(
+        "trial_clock_offset", "(s) the phone sensor's clock minus the video's, null where not estimated", null=True
+    )
 
 
 @record

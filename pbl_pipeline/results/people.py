@@ -6,6 +6,10 @@ import numpy as np
 
 from pbl_pipeline.records import column, record
 
+from .video_facts import CAMERA_KINDS
+
+_KIND_TYPE = f"enum({', '.join(map(repr, CAMERA_KINDS))})"
+
 
 @record
 class TrackFigures:
@@ -39,6 +43,43 @@ class PersonTrack:
         first, last = frames[0], frames[-1]
         times = float(time_s[first]), float(time_s[last])
         return TrackFigures(self.person_id, first, last, *times, seen.sum(), score, height)
+
+
+@record
+class KeypointFigures:
+    """Keypoints of the measured person in figures."""
+
+    marker_set: str = column("marker_set", "names and places of the points", "varchar(32)")
+    n_points: int = column("n_points", "points of the marker set", "int16")
+    root_relative: bool = column("root_relative", "whether 3D points are relative to the root of the body", "bool")
+    n_seen: int = column("n_seen", "frames with at least one point", "int32")
+    median_confidence: float = column(
+        "median_confidence", "(0..1) median over the points that were seen, null when none was", null=True
+    )
+    camera_kind: str = column("camera_kind", "where the intrinsics come from", _KIND_TYPE)
+    camera_source: str = column("camera_source", "the same in words", "varchar(255)", cut=True)
+    focal_px: float = column("focal_length", "(px) mean of fx and fy")
+    focal_rel_sd: float = column(
+        "focal_rel_sd", "(1) standard deviation of the focal length as a share of it, null when unknown", null=True
+    )
+
+
+@record
+class HiddenHeads:
+    """A video with hidden heads in figures."""
+
+    how: str = column(
+        "{}_how", "how heads are hidden; skeleton: keypoints on black", "enum('blur', 'pixelate', 'skeleton')"
+    )
+    status: str = column(
+        "{}_status",
+        "REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered",
+        "enum('CERTAIN', 'REVIEW', 'NO_HEAD')",
+    )
+    reason: str = column("{}_reason", "the status in words", "varchar(255)", cut=True)
+    n_heads: int = column("{}_heads", "heads that were found, false ones included", "int32")
+    n_uncertain: int = column("{}_uncertain", "frames that are not certain", "int32")
+    ranges: tuple[dict, ...] = column("{}_ranges", "runs of these: first and last frame (from 0), and why", "json")
 
 
 @record

@@ -8,6 +8,8 @@ from pbl_pipeline.records import column, record
 
 #: Fields of `VideoInfo` that stand in the row of the file, not in that of its facts.
 OF_FILE = ("path", "sha256", "size_bytes")
+#: Kinds of sources of intrinsics, the most accurate first; `other` if a source names none of them.
+CAMERA_KINDS = ("file", "measured", "metadata", "preset", "guess", "other")
 
 
 @record

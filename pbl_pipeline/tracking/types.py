@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.results.people import PersonTrack
 from pbl_pipeline.video import Frame
 
@@ -53,3 +55,28 @@ class Tracking:
     persons: tuple[PersonTrack, ...]
     detector: str
     model_sha256: str
+
+    def save(self, path: Path) -> None:
+        """Write time stamps and tracks to one npz, float32 but for the time stamps."""
+        n, t, tracks = len(self.persons), len(self.time_s), dict[str, np.ndarray]()
+        for name, rest in _TRACK.items():
+            rows = [getattr(p, name) for p in self.persons]
+            tracks[name] = np.asarray(rows, bool if name == "observed" else np.float32).reshape(n, t, *rest)
+        ids = np.asarray([p.person_id for p in self.persons], np.int16)
+        arrays = {"time_s": np.asarray(self.time_s, np.float64), "person_id": ids, **tracks}
+        np.savez_compressed(path, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path, image_size_px: tuple[int, int], detector: str, model_sha256: str) -> Tracking:
+        """Read what `save` wrote; the other fields are not in the file. Raises `PblError` FILE_FORMAT."""
+        data = load_npz(path, needed=("time_s", "person_id", *_TRACK))
+        n, t = data["person_id"].size, data["time_s"].size
+        shapes = {"time_s": (t,), "person_id": (n,), **{name: (n, t, *rest) for name, rest in _TRACK.items()}}
+        check_numbers(path, data, shapes)
+        tracks = zip(*(data[name] for name in _TRACK), strict=True)
+        persons = tuple(PersonTrack(int(p), *own) for p, own in zip(data["person_id"], tracks, strict=True))
+        return cls(data["time_s"], image_size_px, persons, detector, model_sha256)
+
+
+#: Arrays of a `PersonTrack` -> their shape in a frame.
+_TRACK: dict[str, tuple[int, ...]] = {"box_px": (4,), "roi_px": (4,), "score": (), "observed": ()}

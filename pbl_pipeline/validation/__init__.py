@@ -6,6 +6,7 @@ from .align import align_path
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
 from .compare import (
     CURVE_COLUMNS,
+    OF_OTHERS,
     KinematicErrors,
     compare,
     compare_angles,

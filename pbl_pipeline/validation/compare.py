@@ -14,7 +14,7 @@ from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Z90, GaitCycle, trial_poses
-from pbl_pipeline.records import record
+from pbl_pipeline.records import column, record
 from pbl_pipeline.results import JointError, TrialError
 
 from .align import (
@@ -79,6 +79,10 @@ def _finite(values: Sequence[float] | np.ndarray) -> np.ndarray:
     return v[np.isfinite(v)]
 
 
+#: Fields of `KinematicErrors` that stand in the rows of trial and reference, not in that of the errors.
+OF_OTHERS = ("residual_2d_px", "residual_3d_cm", "trial", "reference", "source", "convention")
+
+
 @record(kw_only=True)
 class KinematicErrors(TrialError):
     """Errors of one trial against its reference."""
@@ -87,13 +91,13 @@ class KinematicErrors(TrialError):
     #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
     view: Mapping[str, str] = dataclasses.field(default_factory=lambda: dict.fromkeys(("right", "left"), MIXED))
     #: Medians of the fit's residuals over frames and markers.
-    residual_2d_px: float = float("nan")
-    residual_3d_cm: float = float("nan")
+    residual_2d_px: float = column("trial_residual_2d", null=True, default=float("nan"))
+    residual_3d_cm: float = column("trial_residual_3d", null=True, default=float("nan"))
     #: Names of fit and reference, and of what kind the reference is.
-    trial: str = ""
-    reference: str = ""
-    source: str = ""
-    convention: str = ""
+    trial: str = column("trial_name", type="varchar(255)", default="")
+    reference: str = column("reference_name", type="varchar(255)", default="")
+    source: str = column("reference_source", type="varchar(64)", default="")
+    convention: str = column("reference_convention", type="varchar(64)", default="")
 
     @property
     def lag_at_limit(self) -> bool:
@@ -344,8 +348,8 @@ def save_curves(frame: pd.DataFrame, path: str | Path) -> Path:
     for joint in dict.fromkeys(frame["joint"]):
         of_joint = frame.loc[np.asarray(frame["joint"] == joint), :]
         pairs = list(of_joint.groupby(["trial", "cycle", "side"], sort=False))
-        for column, name in (("fit_deg", "fit"), ("reference_deg", "reference")):
-            arrays[f"{joint}_{name}"] = np.array([np.asarray(part[column], float) for _, part in pairs])
+        for values, name in (("fit_deg", "fit"), ("reference_deg", "reference")):
+            arrays[f"{joint}_{name}"] = np.array([np.asarray(part[values], float) for _, part in pairs])
         arrays[f"{joint}_cycle"] = np.array(["/".join(str(k) for k in key) for key, _ in pairs], dtype=str)
     np.savez_compressed(path, allow_pickle=False, **arrays)
     return Path(path)

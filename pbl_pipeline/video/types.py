@@ -10,6 +10,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from pbl_pipeline.results.video_facts import CAMERA_KINDS, Intrinsics
+
 
 def cut_image(image: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """`Frame.cut` of a converted picture (H, W, 3) uint8."""
@@ -105,10 +107,6 @@ class Frame:
         return cut_image(self.image, matrix, size_px) if region is None else region
 
 
-#: Kinds of sources of intrinsics, the most accurate first; `other` if a source names none of them.
-CAMERA_KINDS = ("file", "measured", "metadata", "preset", "guess", "other")
-
-
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
@@ -122,6 +120,19 @@ class Camera:
     distortion: np.ndarray
     source: str
     focal_rel_sd: float = math.nan
+
+    @classmethod
+    def of(cls, c: Intrinsics) -> Camera:
+        """Return the camera of the figures of a calibration."""
+        matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
+        rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
+        return cls(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
+
+    def measured(self, size_px: tuple[int, int]) -> Intrinsics:
+        """Return the figures of a calibration, which holds for pictures of a size (width, height)."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        sd, note = self.focal_rel_sd * self.focal_px, self.source.removeprefix("file:").strip()
+        return Intrinsics("measured", *size_px, fx, fy, cx, cy, self.distortion, sd, note)
 
     @property
     def kind(self) -> str:

@@ -643,11 +643,10 @@ def use_kinetics(path: Path) -> None:
 
 def tracking(path: Path) -> None:
     from pbl_pipeline.tracking import PersonTrack, Tracking
-    from pbl_schemas.tracking import save_tracking
 
     box = np.tile([10.0, 10.0, 90.0, 200.0], (N, 1))
     people = tuple(PersonTrack(i, box, box, np.ones(N), np.ones(N, bool)) for i in range(2))
-    save_tracking(Tracking(np.arange(N) / FPS, SIZE_PX, people, "blazepose", "0" * 64), path)
+    Tracking(np.arange(N) / FPS, SIZE_PX, people, "blazepose", "0" * 64).save(path)
 
 
 def use_tracking(path: Path) -> None:
@@ -655,8 +654,8 @@ def use_tracking(path: Path) -> None:
     from types import SimpleNamespace
     from unittest import mock
 
+    from pbl_pipeline.tracking import Tracking
     from pbl_schemas import stored_files
-    from pbl_schemas.tracking import load_tracking
 
     local = SimpleNamespace(protocol="file")
     with (
@@ -664,7 +663,7 @@ def use_tracking(path: Path) -> None:
         mock.patch.object(stored_files, "full_path", lambda _, name: str(path.parent / name)),
         stored_files.stored_file({"path": path.name, "store": "pbl"}) as file,
     ):
-        load_tracking(file, SIZE_PX, "blazepose", "0" * 64)
+        Tracking.load(file, SIZE_PX, "blazepose", "0" * 64)
 
 
 def participants(path: Path) -> None:

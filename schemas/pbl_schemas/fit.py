@@ -16,7 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.fits import DepthFit, Residuals, SensorFit, Solution
+from pbl_pipeline.results.fits import DepthFit, Residuals, SensorFit, Solution, TrialFigures
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
@@ -51,7 +51,7 @@ from .origin import Origin, computes, origin_columns
 from .plan import plan_fit_sets
 from .record_parts import part_of
 from .rows import InputChanged, MadeOnce, delete_below, inside, one
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib
@@ -69,7 +69,7 @@ class SessionFit(dj.Computed):
     {definition(Solution, only=("solver", "loss"))}
     {definition(Residuals, "fit")}
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
-    {definition(Solution, only=("iterations", "converged", "scale"))}
+    {definition(Solution, only=("iterations", "converged", "result", "scale"))}
     fit_height=null      : float64             # (m) body height of the person that the fit was told, null: not known
     {definition(Solution, only=("compile_seconds", "device"))}
     session_file         : <object@arrays>     # npz: scale (8), site_offset_m (J,3) m, loss_trace (K,2)
@@ -77,17 +77,12 @@ class SessionFit(dj.Computed):
     """
 
     class Trial(dj.Part):
-        # trial_orientation is no enum: DataJoint 2.3.5 cannot read one back whose values hold a colon.
         definition = f"""
         # the fitted movement of one video, or of several cameras' trial, which has the number of one of them
         -> master
         -> FitSet.Video
         ---
-        trial_name        : varchar(255)
-        trial_n_fitted    : int32              # frames with joint angles
-        {definition(Residuals, "trial")}
-        trial_orientation=null : varchar(32)   # where the vertical comes from, such as 'measured: phone', null where it was not recorded
-        trial_clock_offset=null : float64      # (s) the phone sensor's clock minus the video's, null where not estimated
+        {definition(TrialFigures, "trial")}
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 
@@ -244,20 +239,10 @@ class SessionFit(dj.Computed):
             for video_id, trial in zip(ids, result.trials, strict=True):
                 path = folder / f"{video_id}.fit.npz"
                 float32_trial(trial).save(path)
-                self.Trial.insert1(
-                    {
-                        **key,
-                        "video_id": video_id,
-                        "trial_name": trial.name,
-                        "trial_n_fitted": int(np.isfinite(trial.qpos).all(axis=1).sum()),
-                        **to_row(Residuals.of([trial]), "trial"),
-                        "trial_orientation": trial.orientation_source,
-                        "trial_clock_offset": number(trial.phone_clock_offset_s),
-                        "trial_file": path,
-                    }
-                )
-                self.Sensor.insert_records({**key, "video_id": video_id}, trial.sensors)
-                self.Depth.insert_records({**key, "video_id": video_id}, [trial.depth] if trial.depth else [])
+                of_trial = {**key, "video_id": video_id}
+                self.Trial.insert1({**of_trial, **to_row(trial.figures, "trial"), "trial_file": path})
+                self.Sensor.insert_records(of_trial, trial.sensors)
+                self.Depth.insert_records(of_trial, [trial.depth] if trial.depth else [])
         self.Check.insert_records(key, result.qc)
 
 
@@ -360,8 +345,7 @@ def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:
     """Return the library's `TrialFit` in a file of the store."""
     from pbl_pipeline.fit import TrialFit
 
-    with stored_file(ref) as path:
-        return TrialFit.load(path)
+    return read_stored(ref, TrialFit.load)
 
 
 def trial_key(video_id: int) -> dict[str, Any] | None:
@@ -371,10 +355,9 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
     return {k: rows[0][k] for k in SessionFit.Trial.primary_key} if rows else None
 
 
-def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
-    """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
-    found = SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
-    return [dataclasses.astuple(check) for check in found]
+def fit_checks(key: Mapping[str, Any]) -> list[Quality]:
+    """The checks of one session fit, by a key with its own."""
+    return SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:

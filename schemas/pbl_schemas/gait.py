@@ -24,7 +24,7 @@ from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .review import Decision
 from .rows import Rows, one, row_of, stored_rows
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait.metrics_file import Curves
@@ -207,14 +207,13 @@ class GaitCycle(dj.Computed):
         key: dict,
         events: Events,
         ref: dict,
-        checks: Sequence[tuple],
+        checks: Sequence[Quality],
         correction: Mapping[str, Any] | None,
         accepted: float | None,
     ) -> tuple[tuple[Cycle, ...], int | None]:
         from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
-        from pbl_pipeline.qc import Check
 
-        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=[Check(*check) for check in checks])
+        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=checks)
         if accepted is not None and refused_cadence(cycles) == accepted:
             cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
@@ -260,15 +259,14 @@ class Spatiotemporal(dj.Computed):
         rows: Sequence[Mapping[str, Any]],
         activity: str,
         ref: dict,
-        checks: Sequence[tuple],
+        checks: Sequence[Quality],
     ) -> tuple[Measures]:
         from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
-        from pbl_pipeline.qc import Check
 
         found = spatiotemporal([cycle_of_row(r, name) for r in rows])
         if activity in TASK_MEASURES:
             motion = task_motion(fit.load_trial(ref))
-            found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
+            found = found.with_task(*task_measures(motion, activity, checks))
         return (found,)
 
     def make_insert(self, key: dict, result: Measures, origin: Origin) -> None:
@@ -316,12 +314,7 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
     """The library's cycle of a row of GaitCycle.Cycle."""
     if row["cycle_length_ratio"] is not None and row["cycle_length_unproven"] is None:
         row = {**row, "cycle_length_unproven": True}  # older than the column: not known, so the spread is withheld
-    of_file = (
-        {"curves": dict(curves.deg), "curves_sd": dict(curves.sd_deg), "error_model": curves.error_model}
-        if curves
-        else {}
-    )
-    return from_row(Cycle, row, trial=trial, **of_file)
+    return from_row(Cycle, row, trial=trial, **({} if curves is None else curves._asdict()))
 
 
 def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[Cycle]:
@@ -333,6 +326,5 @@ def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], tr
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
     from pbl_pipeline.gait.metrics_file import load_curves
 
-    with stored_file(ref) as path:
-        curves = load_curves(path)
+    curves = read_stored(ref, load_curves)
     return [cycle_of_row(r, trial, curves.get(int(r["cycle_no"]))) for r in rows]

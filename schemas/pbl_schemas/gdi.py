@@ -18,7 +18,7 @@ from .method_rows import method_columns, method_row, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .rows import InputChanged, Rows, one, row_of, stored_rows, utc_now
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -281,11 +281,7 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
     """The library's normative set, checked to be the one of the row. Raises NORM_UNKNOWN, NORM_INVALID."""
     from pbl_pipeline.gait import load_norm
 
-    if ref is None:
-        norm = load_norm(name)
-    else:
-        with stored_file(ref) as path:
-            norm = load_norm(str(path))
+    norm = load_norm(name) if ref is None else read_stored(ref, lambda path: load_norm(str(path)))
     if norm.sha256 != sha256:
         raise PblError(
             "NORM_INVALID",

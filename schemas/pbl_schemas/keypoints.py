@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import from_row, number
+from pbl_pipeline.records import definition, from_row, to_row
+from pbl_pipeline.results.people import KeypointFigures
 from pbl_pipeline.results.video_facts import Intrinsics
 from pbl_pipeline.temporary import new_folder
 
@@ -20,7 +19,7 @@ from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import one
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import keypoints as lib
@@ -56,15 +55,7 @@ class Keypoints(dj.Computed):
     -> KeypointSelection
     ---
     keypoints_person_id   : int16              # number of the measured person in the tracking
-    marker_set            : varchar(32)        # names and places of the points
-    n_points              : int16              # points of the marker set
-    root_relative         : bool               # whether 3D points are relative to the root of the body
-    n_seen                : int32              # frames with at least one point
-    median_confidence=null: float64            # (0..1) median over the points that were seen, null when none was
-    camera_kind           : enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')  # where the intrinsics come from
-    camera_source         : varchar(255)       # the same in words
-    focal_length          : float64            # (px) mean of fx and fy
-    focal_rel_sd=null     : float64            # (1) standard deviation of the focal length as a share of it, null when unknown
+    {definition(KeypointFigures)}
     keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
     phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
@@ -80,21 +71,12 @@ class Keypoints(dj.Computed):
         return tracking.chosen().proj() * KeypointSelection.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
-        probed = one(video.Video * video.VideoInfo & key)
-        times = file_ref(probed.pop("frame_time"))
-        person = one(tracking.chosen() & key, "chosen_person_id")
-        tracks, detector, model = one(tracking.Tracking & key, "tracks", "detector", "tracking_model_sha256")
-        camera = video.camera_of(probed)
-        log = (video.PhoneAttitude & key).to_dicts()
-        return (
-            probed,
-            times,
-            int(person),
-            (file_ref(tracks), detector, model),
-            camera,
-            (log[0]["attitude_name"], file_ref(log[0]["attitude_file"])) if log else None,
-            method_row(KeypointMethod, key),
-        )
+        probed, times = video.probed(key)
+        person = int(one(tracking.chosen() & key, "chosen_person_id"))
+        logs = (video.PhoneAttitude & key).to_dicts()
+        log = (logs[0]["attitude_name"], file_ref(logs[0]["attitude_file"])) if logs else None
+        seen = person, tracking.tracks_of(key), video.camera_of(probed), log
+        return probed, times, *seen, method_row(KeypointMethod, key)
 
     @computes
     def make_compute(
@@ -111,16 +93,12 @@ class Keypoints(dj.Computed):
         from pbl_pipeline.keypoints import check_keypoints, detect_keypoints
         from pbl_pipeline.video import attitude_of, check_timing, find_camera, read_phone_log
 
-        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
+        path, info = video.read_probed(probed, times, key)
         detector = methods.stored(**method)
-        with stored_file(times) as stored:
-            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         attitude = None
         if log is not None:
-            with stored_file(log[1]) as stored:
-                attitude = attitude_of(read_phone_log(stored), Path(log[0]), info)
-        with stored_file(tracks[0]) as stored:
-            everybody = tracking.load_tracking(stored, (info.width_px, info.height_px), *tracks[1:])
+            attitude = attitude_of(read_stored(log[1], read_phone_log), Path(log[0]), info)
+        everybody = tracking.load_tracking(*tracks)
         view = camera_of_row(camera) if camera else find_camera(info)
         found = detect_keypoints(path, everybody, person, view, params=detector)
         if attitude is not None:
@@ -143,22 +121,13 @@ class Keypoints(dj.Computed):
         camera_id: int | None,
         origin: Origin,
     ) -> None:
-        seen = found.confidence > 0
         with new_folder() as folder:
             found.save(folder / "keypoints.npz")
             self.insert1(
                 {
                     **key,
                     "keypoints_person_id": person,
-                    "marker_set": found.marker_set,
-                    "n_points": len(found.names),
-                    "root_relative": found.root_relative,
-                    "n_seen": int(seen.any(axis=1).sum()),
-                    "median_confidence": number(np.median(found.confidence[seen])) if seen.any() else None,
-                    "camera_kind": found.camera.kind,
-                    "camera_source": found.camera.source[:255],
-                    "focal_length": found.camera.focal_px,
-                    "focal_rel_sd": number(found.camera.focal_rel_sd),
+                    **to_row(found.figures),
                     "keypoints_camera_id": camera_id,
                     "phone_log": None if log is None else log[:255],
                     "keypoints_file": folder / "keypoints.npz",
@@ -172,8 +141,5 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     """The library's `Camera` from a row of CameraCalibration with `turn_deg` (`video.camera_of`)."""
     from pbl_pipeline.video import Camera, turned_camera
 
-    c = from_row(Intrinsics, row)
-    matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
-    rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
-    camera = Camera(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
-    return turned_camera(camera, (c.width_px, c.height_px), row["turn_deg"])
+    found = from_row(Intrinsics, row)
+    return turned_camera(Camera.of(found), (found.width_px, found.height_px), row["turn_deg"])

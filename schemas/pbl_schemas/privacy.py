@@ -7,17 +7,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
+from pbl_pipeline.records import definition, to_row
+from pbl_pipeline.results.people import HiddenHeads
 from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from . import video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -32,12 +31,7 @@ class Deidentified(dj.Computed):
     # a video with hidden heads, where PBL_DEIDENTIFY asks for it; overlays and reports show its pictures
     -> video.VideoInfo
     ---
-    deidentified_how         : enum('blur', 'pixelate', 'skeleton')  # how heads are hidden; skeleton: keypoints on black
-    deidentified_status      : enum('CERTAIN', 'REVIEW', 'NO_HEAD')  # REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered
-    deidentified_reason      : varchar(255)     # the status in words
-    deidentified_heads       : int32            # heads that were found, false ones included
-    deidentified_uncertain   : int32            # frames that are not certain
-    deidentified_ranges      : json             # runs of these: first and last frame (from 0), and why
+    {definition(HiddenHeads, "deidentified")}
     deidentified_sha256      : char(64)         # of the bytes of the copy
     deidentified_file        : <object@arrays>  # mp4 without sound and metadata, frame by frame as the recording; docs/privacy.md
     {origin_columns("deidentified")}
@@ -55,8 +49,7 @@ class Deidentified(dj.Computed):
         return video.VideoInfo.proj() & self.wanted()
 
     def make_fetch(self, key: dict) -> tuple:
-        probed = one(video.Video * video.VideoInfo & key)
-        return probed, file_ref(probed.pop("frame_time"))
+        return video.probed(key)
 
     @computes
     def make_compute(
@@ -72,9 +65,7 @@ class Deidentified(dj.Computed):
                 expected="blur, pixelate or skeleton",
                 next_step="set it as on the machine that queued the job, then `pbl retry`",
             )
-        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
-        with stored_file(times) as stored:
-            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
+        path, info = video.read_probed(probed, times, key)
         folder = new_folder()
         done = deidentify(path, folder.path / "deidentified.mp4", how, info=info)
         return done, folder, sha256_of(done.path)
@@ -84,18 +75,8 @@ class Deidentified(dj.Computed):
     ) -> None:
         # The folder goes with the object: an insert that meets a deadlock is tried again.
         assert folder.path.is_dir()
-        row = {
-            "how": done.how,
-            "status": done.status,
-            "reason": done.reason[:255],
-            "heads": done.n_heads,
-            "uncertain": done.n_uncertain,
-            "ranges": [{"first": a, "last": b, "why": list(done.why(a, b))} for a, b in done.uncertain],
-            "sha256": sha256,
-            "file": done.path,
-        }
-        own = {f"deidentified_{name}": value for name, value in row.items()}
-        self.insert1({**key, **own, **origin.row("deidentified")})
+        copy = {"deidentified_sha256": sha256, "deidentified_file": done.path}
+        self.insert1({**key, **to_row(done.figures, "deidentified"), **copy, **origin.row("deidentified")})
 
 
 def copy_of(video_id: int) -> str:

@@ -62,9 +62,14 @@ class Measures:
         return None if row[f"{cls.prefix}_mean"] is None else from_row(cls.record, row, cls.prefix)
 
     @classmethod
-    def measures(cls, key: Any, rows: Rows = stored_rows) -> dict[str, tuple[Any, str]]:
-        """Return each measure of a result by its name, with the reason where it is not known."""
-        return {r[cls.by]: (cls.measure(r), str(r[f"{cls.prefix}_missing"])) for r in rows(cls, key)}
+    def measures(
+        cls, key: Any, order: Iterable[str] = (), rows: Rows = stored_rows
+    ) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the measures of a result by name, those of `order` before others, and why one is not known."""
+        found = {r[cls.by]: r for r in rows(cls, key)}
+        found = {n: found[n] for n in (*order, *found) if n in found}
+        missing = {n: str(r[f"{cls.prefix}_missing"]) for n, r in found.items()}
+        return {n: cls.measure(r) for n, r in found.items()}, {n: why for n, why in missing.items() if why}
 
 
 def part_of(

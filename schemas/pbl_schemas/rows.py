@@ -152,11 +152,6 @@ def moment(at: datetime.datetime | str) -> str:
     return f"{zoned.astimezone():%Y-%m-%d %H:%M}"
 
 
-def or_nan(value: float | None) -> float:
-    """Return the number of a nullable column; NaN for NULL."""
-    return float("nan") if value is None else float(value)
-
-
 def parts(values: Iterable[T]) -> Iterator[list[T]]:
     """Yield the values, `PART` at a time."""
     rest = iter(values)

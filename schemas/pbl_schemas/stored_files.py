@@ -7,16 +7,18 @@ import functools
 import glob
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.temporary import new_folder
 
 from . import connection
 from .datajoint_setup import backend_of, build_object_path, full_path
+
+T = TypeVar("T")
 
 _unusable = functools.partial(
     PblError,
@@ -48,6 +50,12 @@ def stored_file(ref: Mapping[str, Any]) -> Iterator[Path]:
         backend.get_file(ref["path"], path)
         with _readable(path, ref):
             yield path
+
+
+def read_stored(ref: Mapping[str, Any], read: Callable[[Path], T]) -> T:
+    """Return what a function reads from an object of the store. Raises what `stored_file` does."""
+    with stored_file(ref) as path:
+        return read(path)
 
 
 @contextmanager

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError, said
-from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.records import definition, to_row
 from pbl_pipeline.results.people import SubjectChoice as Choice
 from pbl_pipeline.results.people import TrackFigures
@@ -22,7 +18,7 @@ from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import delete_below, inside, one, utc_now
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import tracking as lib
@@ -94,9 +90,7 @@ class Tracking(dj.Computed):
         return TrackingSelection.proj() * video.VideoInfo.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
-        method = method_row(TrackingMethod, key)
-        probed = one(video.Video * video.VideoInfo & key)
-        return probed, file_ref(probed.pop("frame_time")), method
+        return *video.probed(key), method_row(TrackingMethod, key)
 
     @computes
     def make_compute(
@@ -104,15 +98,13 @@ class Tracking(dj.Computed):
     ) -> tuple[lib.Tracking, str]:
         from pbl_pipeline.tracking import track_people
 
-        path = video.registered_file(probed["video_path"], probed["video_sha256"], key)
+        path, info = video.read_probed(probed, times, key)
         tracker = methods.stored(**method)
-        with stored_file(times) as stored:
-            info = video.info_of_row(probed, np.load(stored, allow_pickle=False))
         return track_people(path, params=tracker, info=info), tracker.hash
 
     def make_insert(self, key: dict, tracking: lib.Tracking, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
-            save_tracking(tracking, folder / "tracks.npz")
+            tracking.save(folder / "tracks.npz")
             row = {"n_persons": len(tracking.persons), "detector": tracking.detector, "tracks": folder / "tracks.npz"}
             of_model = origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256)
             self.insert1({**key, **row, **of_model})
@@ -133,13 +125,11 @@ class SubjectChoice(dj.Computed):
 
     def make_fetch(self, key: dict) -> tuple:
         file = one(video.Video & key, "video_path", "video_sha256")
-        tracks, detector, model = one(Tracking & key, "tracks", "detector", "tracking_model_sha256")
-        size = one(video.VideoInfo & key, "width", "height")
         override = (SubjectOverride & key).to_dicts()
         person = int(override[0]["override_person_id"]) if override else None
         method = method_row(SubjectMethod, one(TrackingSelection & key))
         elsewhere = None if override else _decided_elsewhere(key)
-        return file, file_ref(tracks), (int(size[0]), int(size[1])), (detector, model), person, elsewhere, method
+        return file, tracks_of(key), person, elsewhere, method
 
     @property
     def key_source(self) -> Any:
@@ -150,9 +140,7 @@ class SubjectChoice(dj.Computed):
         self,
         key: dict,
         file: tuple,
-        ref: dict,
-        size: tuple,
-        about: tuple,
+        tracks: tuple,
         override: int | None,
         elsewhere: tuple | None,
         method: Mapping[str, Any],
@@ -160,15 +148,12 @@ class SubjectChoice(dj.Computed):
         from pbl_pipeline.tracking import carried_choice, choose_subject, contact_sheet_jpeg
 
         chooser = methods.stored(**method)
-        with stored_file(ref) as path:
-            tracking = load_tracking(path, size, *about)
+        tracking = load_tracking(*tracks)
         if elsewhere is None:
             choice = choose_subject(tracking, params=chooser, override=override)
         else:
-            other_tracks, other_about, number_there, other_method = elsewhere
-            with stored_file(other_tracks) as path:
-                other = load_tracking(path, size, *other_about)
-            choice = carried_choice(other, number_there, other_method, tracking, chooser)
+            others, number_there, other_method = elsewhere
+            choice = carried_choice(load_tracking(*others), number_there, other_method, tracking, chooser)
         sheet = None
         if choice.status == "NEEDS_CHOICE":
             path = video.registered_file(file[0], file[1], key)
@@ -189,17 +174,30 @@ def chosen() -> Any:
     return SubjectChoice & [{"choice_status": s} for s in CHOSEN]
 
 
+def tracks_of(key: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[int, int], str, str]:
+    """Return the arguments of `load_tracking` for one row of Tracking: what `make_fetch` hands on."""
+    row = one(Tracking * video.VideoInfo.proj("width", "height") & key)
+    size = int(row["width"]), int(row["height"])
+    return file_ref(row["tracks"]), size, row["detector"], row["tracking_model_sha256"]
+
+
+def load_tracking(ref: Mapping[str, Any], *about: Any) -> lib.Tracking:
+    """Return the library's `Tracking` of a file of the store; `about`: as for `Tracking.load`."""
+    from pbl_pipeline.tracking import Tracking
+
+    return read_stored(ref, lambda path: Tracking.load(path, *about))
+
+
 def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
-    """Return the last decision about another tracking of this video: its tracks, detector and model, the person's
-    number there, the method; None without one."""
+    """Return the last decision about another tracking of this video: its `tracks_of`, the person's number there, the
+    method; None without one."""
     others = Tracking * SubjectOverride & {"video_id": key["video_id"]}
     others &= f"tracking_method != '{key['tracking_method']}'"
     for row in others.to_dicts(order_by=["override_created DESC", "tracking_method"]):
         there = {k: row[k] for k in Tracking.primary_key}
         number_there = int(row["override_person_id"])
         if Tracking.Person & there & {"person_id": number_there}:
-            about = (row["detector"], row["tracking_model_sha256"])
-            return file_ref(row["tracks"]), about, number_there, row["tracking_method"]
+            return tracks_of(there), number_there, row["tracking_method"]
     return None
 
 
@@ -260,35 +258,3 @@ def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
     withdrawn = (SubjectChoice & {"choice_status": "MANUAL"}) - SubjectOverride
     outdated = SubjectChoice & [differs.proj(), withdrawn.proj()] & restriction
     return delete_below(SubjectChoice, outdated.keys())
-
-
-# ------------------------------------------------------------------------------------------------------- files, rows
-def save_tracking(tracking: lib.Tracking, path: Path) -> None:
-    """Write all tracks of a video to one npz, float32 but for the time stamps."""
-    t, people = len(tracking.time_s), tracking.persons
-    stack = {
-        "box_px": np.zeros((len(people), t, 4), np.float32),
-        "roi_px": np.zeros((len(people), t, 4), np.float32),
-        "score": np.zeros((len(people), t), np.float32),
-        "observed": np.zeros((len(people), t), bool),
-    }
-    for i, person in enumerate(people):
-        for name, array in stack.items():
-            array[i] = getattr(person, name)
-    ids = np.asarray([p.person_id for p in people], np.int16)
-    np.savez_compressed(path, time_s=np.asarray(tracking.time_s, np.float64), person_id=ids, **stack)
-
-
-def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> lib.Tracking:
-    """The `Tracking` from the npz that `save_tracking` wrote and the row's figures. Raises FILE_FORMAT."""
-    from pbl_pipeline import tracking as lib
-
-    data = load_npz(path, needed=("time_s", "person_id", "box_px", "roi_px", "score", "observed"))
-    n, t = data["person_id"].size, data["time_s"].size
-    shapes = {"time_s": (t,), "person_id": (n,), "box_px": (n, t, 4), "roi_px": (n, t, 4)}
-    check_numbers(path, data, {**shapes, "score": (n, t), "observed": (n, t)})
-    people = tuple(
-        lib.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
-        for i, p in enumerate(data["person_id"])
-    )
-    return lib.Tracking(data["time_s"], size_px, people, detector, model_sha256)

@@ -12,8 +12,8 @@ from . import fit, session, video  # noqa: F401  definitions refer to session an
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
-from .rows import one, or_nan
-from .stored_files import file_ref, stored_file
+from .rows import one
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import validation as lib
@@ -78,13 +78,13 @@ class KinematicError(dj.Computed):
     ) -> tuple[lib.KinematicErrors]:
         from pbl_pipeline import validation as lib
 
-        with stored_file(reference) as path:
-            truth = lib.Reference.load(path)
-        return (lib.compare(fit.load_trial(fitted), truth),)
+        return (lib.compare(fit.load_trial(fitted), read_stored(reference, lib.Reference.load)),)
 
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
-        view = {f"error_view_{side}": seen for side, seen in errors.view.items()}
-        self.insert1({**fit.of_session(key), **to_row(errors), **view, **origin.row("error")})
+        from pbl_pipeline.validation import OF_OTHERS
+
+        row = to_row(errors, without=OF_OTHERS) | {f"error_view_{side}": v for side, v in errors.view.items()}
+        self.insert1({**fit.of_session(key), **row, **origin.row("error")})
         self.Joint.insert_records(key, errors.joints)
 
 
@@ -95,15 +95,6 @@ def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) 
     """
     from pbl_pipeline import validation as lib
 
-    return from_row(
-        lib.KinematicErrors,
-        row,
-        joints=tuple(from_row(JointError, joint) for joint in joints),
-        view={side: row[f"error_view_{side}"] for side in ("left", "right")},
-        residual_2d_px=or_nan(row["trial_residual_2d"]),
-        residual_3d_cm=or_nan(row["trial_residual_3d"]),
-        trial=row["trial_name"],
-        reference=row["reference_name"],
-        source=row["reference_source"],
-        convention=row["reference_convention"],
-    )
+    view = {side: row[f"error_view_{side}"] for side in ("left", "right")}
+    own = tuple(from_row(JointError, joint) for joint in joints)
+    return from_row(lib.KinematicErrors, row, joints=own, view=view)

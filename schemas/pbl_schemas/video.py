@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from . import lab, session  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
 from .rows import Rows, one, row_of, stored_rows
+from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait import Condition
@@ -199,6 +201,18 @@ class VideoInfo(dj.Computed):
     def make_insert(self, key: dict, info: Info, origin: Origin) -> None:
         row = {**to_row(info, without=OF_FILE), "frame_time": info.time_s}
         self.insert1({**key, **row, **origin.row("video_info")})
+
+
+def probed(key: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the joined row of Video and VideoInfo, and the file of its time stamps: what `make_fetch` hands on."""
+    row = one(Video * VideoInfo & key)
+    return row, file_ref(row.pop("frame_time"))
+
+
+def read_probed(row: Mapping[str, Any], times: Mapping[str, Any], key: dict) -> tuple[Path, Info]:
+    """Return the file and the facts of a video from what `probed` returned. Raises as `registered_file`."""
+    path = registered_file(row["video_path"], row["video_sha256"], key)
+    return path, info_of_row(row, read_stored(times, functools.partial(np.load, allow_pickle=False)))
 
 
 def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Info:

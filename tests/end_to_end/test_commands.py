@@ -131,7 +131,7 @@ def test_session_json_is_as_described(fitted):
     for word, key in {"solver": "solver", "hash": "params_hash", "scale": "scale", "device": "device"}.items():
         assert word in described
         assert content[key]
-    assert content["converged"] is True
+    assert (content["converged"], content["result"] in ("small_step", "small_gain")) == (True, True)
     assert content["loss_trace"][-1][0] == content["iterations"] > 1
     assert content["orientation_source"] == {"walking": "estimated: gait"}
     assert content["phone_clock_offset_s"] == {"walking": None}

@@ -151,6 +151,7 @@ def fit_session(trials, names, paramset=None, camera_motion="static", height_m=N
         loss_trace=np.array([[0.0, 20.0], [7.0, 2.0]]),
         iterations=7,
         converged=True,
+        result="small_step",
         solver="gauss-newton",
         params_hash=paramset.hash if paramset is not None else "",
         seconds=0.1,

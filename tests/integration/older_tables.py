@@ -148,11 +148,16 @@ def undo_0010(cursor: Any) -> None:
             cursor.execute(f"ALTER TABLE pbl_gdi.{table} DROP COLUMN {column}")
 
 
-def undo_0013(cursor: Any) -> None:
-    """Forget which depth recordings are read, and their scale."""
-    cursor.execute("ALTER TABLE pbl_video.depth_video DROP COLUMN depth_read, DROP COLUMN depth_scale")
-
-
 def undo_0012(cursor: Any) -> None:
     """Forget the segments of wearable sensors."""
     cursor.execute("ALTER TABLE pbl_video.wearable_imu DROP COLUMN imu_rate, DROP COLUMN imu_segments")
+
+
+def undo_0013(cursor: Any) -> None:
+    """Forget why the solvers of fits ended."""
+    cursor.execute("ALTER TABLE pbl_fit.__session_fit DROP COLUMN fit_result")
+
+
+def undo_0014(cursor: Any) -> None:
+    """Forget which depth recordings are read, and their scale."""
+    cursor.execute("ALTER TABLE pbl_video.depth_video DROP COLUMN depth_read, DROP COLUMN depth_scale")

@@ -18,6 +18,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_schemas import (
     connection,
+    fit,
     gait,
     gdi,
     jobs,
@@ -36,6 +37,7 @@ from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.decisions import event_corrections, review_decisions
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.reading import frames
+from pbl_schemas.reading.visits import load_visit
 from pbl_schemas.studies import slices
 from pbl_workers import heartbeat, loop
 from pbl_workers.populate import populate
@@ -161,7 +163,7 @@ def without_sizes(folder: Path) -> None:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute("DROP DATABASE pbl_validation")
 
-    _undo(undo_sizes, older_tables.undo_0003, older_tables.undo_0002)
+    _undo(undo_sizes, older_tables.undo_0013, older_tables.undo_0003, older_tables.undo_0002)
 
 
 def without_session(folder: Path) -> dict[str, list[tuple]]:
@@ -176,6 +178,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0014,
         older_tables.undo_0013,
         older_tables.undo_0012,
         older_tables.undo_0010,
@@ -352,6 +355,10 @@ def test_an_older_database_keeps_its_rows_and_works(older: None, tmp_path: Path)
     _compute()
     assert set(frames.session_summary()["subject"]) == {"P001", "P002"}
     assert set(video.Video.to_arrays("video_size")) > {7}
+    # Why a solver ended is not known of earlier fits.
+    assert fit.SessionFit.to_arrays("fit_result", order_by="session_id").tolist() == [None, "small_step"]
+    solutions = [load_visit({"subject": subject}, measures=False).solution for subject in ("P001", "P002")]
+    assert [(s.result, s.converged) for s in map(not_none, solutions)] == [(None, True), ("small_step", True)]
 
 
 def test_results_from_before_they_had_their_session_get_it(put: Put):

@@ -10,6 +10,7 @@ from moto.server import ThreadedMotoServer
 import pbl_pipeline.video
 import pbl_schemas
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.tracking import Tracking
 from pbl_schemas import connection, store, tracking, video
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.operations import backup, forget
@@ -78,7 +79,7 @@ def test_arrays_and_files_go_to_the_bucket_and_come_back(remote: None, tmp_path:
     # <object@>: as a file that is gone afterwards
     ref = file_ref(tracking.Tracking.fetch1("tracks"))
     with stored_file(ref) as local:
-        found = tracking.load_tracking(local, (1920, 1080), "stand-in", "0" * 64)
+        found = Tracking.load(local, (1920, 1080), "stand-in", "0" * 64)
     assert not local.exists()
     np.testing.assert_allclose(found.persons[0].box_px, chain.track_people(path).persons[0].box_px, rtol=1e-6)
     # a file that is lost has a code and a next step

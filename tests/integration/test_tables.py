@@ -111,7 +111,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
         "KinematicError": 0,
         "Deidentified": 0,
     }
-    assert fit.SessionFit.fetch1("fit_iterations", "fit_converged") == (7, True)
+    assert fit.SessionFit.fetch1("fit_iterations", "fit_converged", "fit_result") == (7, True, "small_step")
     assert set(fit.SessionFit.Trial.to_arrays("trial_orientation")) == {"assumed: level"}
     assert [r["trial_clock_offset"] for r in fit.SessionFit.Trial.to_dicts()] == [None, None]
     (row,) = pipeline_status().errors

@@ -200,7 +200,7 @@ def test_the_solver_begins_at_its_start(handheld):
     off = (Rotation.from_matrix(solution.R_nc[session.frames(0), 0]) * Rotation.from_rotvec(start).inv()).magnitude()
     assert np.rad2deg(off).max() < 8
     assert solution.iterations == 0
-    assert not solution.converged
+    assert not solution.result.converged
     assert solution.loss_trace.shape == (0, 2)
 
 

@@ -17,10 +17,10 @@ from pbl_pipeline.qc import Check
 from pbl_pipeline.records import column, declared, definition, from_json, from_row, plain, record, stored, to_row
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvent, GaitEvents, SetEvent
-from pbl_pipeline.results.fits import Residuals
+from pbl_pipeline.results.fits import Residuals, TrialFigures
 from pbl_pipeline.results.index import NormFacts, VariableScore
 from pbl_pipeline.results.measures import Measure
-from pbl_pipeline.results.people import TrackFigures
+from pbl_pipeline.results.people import HiddenHeads, KeypointFigures, TrackFigures
 from pbl_pipeline.results.video_facts import Intrinsics
 
 
@@ -105,6 +105,7 @@ VALUES: dict[Any, Any] = {
     float: 1.5, int: 3, bool: True, np.ndarray: np.array([1.5, 2.5]), dict[int, float]: {2: 0.5},
     tuple[str, ...]: ("a",),
     tuple[tuple[float, float], ...]: ((0.5, 1.5),),
+    tuple[dict, ...]: ({"first": 0, "why": ["held"]},),
 }  # fmt: skip
 
 
@@ -131,7 +132,10 @@ def filled(cls: Any) -> Any:
 RESULTS = [c for c in vars(results).values() if isinstance(c, type) and dataclasses.is_dataclass(c) and declared(c)]
 
 
-@pytest.mark.parametrize("cls", [*RESULTS, Check, SetEvent, NormFacts, Residuals, Intrinsics, TrackFigures])
+OTHERS = [Check, SetEvent, NormFacts, Residuals, TrialFigures, Intrinsics, TrackFigures, KeypointFigures, HiddenHeads]
+
+
+@pytest.mark.parametrize("cls", [*RESULTS, *OTHERS])
 def test_every_field_with_a_column_survives_row_and_json(cls: Any):
     """A column of two fields would lose one of them; so would one that is not read as it is written."""
     whole = filled(cls)

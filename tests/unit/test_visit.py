@@ -355,7 +355,7 @@ def make_old(folder: Path) -> None:
             del trial["events"], trial["gait_cycles"], trial["pooled"], trial["gdi"]["cycles"]
 
     changed(folder / "metrics.json", of_metrics)
-    changed(folder / "session.json", lambda content: content.pop("visit"))
+    changed(folder / "session.json", lambda content: (content.pop("visit"), content.pop("result")))
     for path in folder.glob("*.cycles.npz"):
         path.unlink()
 
@@ -370,6 +370,7 @@ def test_a_folder_of_an_older_version_is_read_and_says_what_it_lacks(two: Visit,
         f"no back.cycles.npz: {again}",
     )
     assert (found.subject, found.methods) == ("-", {})
+    assert_same(dataclasses.replace(not_none(two.solution), result=None), found.solution)
     assert [(r.name, r.video, r.choice, r.cycles) for r in found.fitted] == [
         ("walk", None, None, ()),
         ("back", None, None, ()),

@@ -108,7 +108,7 @@ class LevenbergMarquardt(Generic[S]):
             damping=jnp.asarray(DAMPING_START, jnp.float32),
             iteration=jnp.asarray(-1, jnp.int32),
             idle=jnp.asarray(0, jnp.int32),
-            result=jnp.asarray(Result.BOUND, jnp.int32),
+            result=jnp.asarray(Result.MAX_STEPS_REACHED, jnp.int32),
             trace=jnp.full(MOST_ITERATIONS, jnp.nan, jnp.float32),
         )
 
@@ -129,7 +129,7 @@ class LevenbergMarquardt(Generic[S]):
         gained = p.cost - now.cost > limits.gain * p.cost
         # A refused step is not evidence of a minimum: the next one is damped more.
         idle = jnp.where(better, jnp.where(gained, 0, p.idle + 1), p.idle)
-        result = jnp.where(idle >= 3, Result.SMALL_GAIN, Result.BOUND)
+        result = jnp.where(idle >= 3, Result.SMALL_GAIN, Result.MAX_STEPS_REACHED)
         result = jnp.where(better & (p.step < limits.step), Result.SMALL_STEP, result)
         dx, dy = solve(_damped(latest.system, damping), latest.g, latest.h)
         dx = jnp.clip(dx, -LONGEST_STEP, LONGEST_STEP)
@@ -171,7 +171,7 @@ class LevenbergMarquardt(Generic[S]):
 
 def terminate(p: Progress, limits: Limits) -> Array:
     """True where the iteration has ended."""
-    return (p.result != Result.BOUND) | (p.iteration >= jnp.minimum(limits.iterations, MOST_ITERATIONS))
+    return (p.result != Result.MAX_STEPS_REACHED) | (p.iteration >= jnp.minimum(limits.iterations, MOST_ITERATIONS))
 
 
 def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:

@@ -9,7 +9,7 @@ class Result(enum.IntEnum):
     """A code that fits into an array, so that a compiled loop can carry it."""
 
     #: At its bound on iterations or steps, or not ended yet.
-    BOUND = 0
+    MAX_STEPS_REACHED = 0
     #: After a step in which no unknown moved further than the limit.
     SMALL_STEP = 1
     #: After steps that hardly lowered the cost.
@@ -18,4 +18,4 @@ class Result(enum.IntEnum):
     @property
     def converged(self) -> bool:
         """True if the solver ended at a minimum."""
-        return self is not Result.BOUND
+        return self is not Result.MAX_STEPS_REACHED

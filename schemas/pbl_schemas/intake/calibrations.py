@@ -20,7 +20,6 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
 from pbl_pipeline.records import number, to_row
-from pbl_pipeline.results.video_facts import Intrinsics
 
 from .. import keypoints, lab, video
 from ..queues import forget_errors
@@ -35,11 +34,8 @@ def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
     """Return the library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its
     number. Raises `PblError` USAGE for the name of a file or camera with control characters."""
     check_label("name of the calibration", camera.source, 1000)
-    (fx, _, cx), (_, fy, cy), _ = camera.matrix
-    sd, note = camera.focal_rel_sd * camera.focal_px, camera.source.removeprefix("file:").strip()
-    found = to_row(Intrinsics("measured", *size_px, fx, fy, cx, cy, camera.distortion, sd, note))
     # Only what is known: calibrations that were stored without `camera_focal_sd` keep their hash.
-    row = {name: value for name, value in found.items() if value is not None}
+    row = {name: value for name, value in to_row(camera.measured(size_px)).items() if value is not None}
     return {**row, "camera_sha256": hashlib.sha256(canonical_json(row).encode()).hexdigest()}
 
 

@@ -13,7 +13,7 @@ from pbl_pipeline.results import Gdi
 
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
-from ..stored_files import file_ref, stored_file
+from ..stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -186,7 +186,7 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
     visits = current_sets() * fit.SessionFit.proj("fit_scale") * gdi.SessionGdi.proj("session_status")
     for row in (visits & {"session_status": "PASS"} & restriction).to_dicts(order_by="session_id"):
         key = {k: row[k] for k in gdi.SessionGdi.primary_key}
-        measures = {name: m for name, (m, _) in gdi.SessionGdi.Measure.measures(key).items()}
+        measures = gdi.SessionGdi.Measure.measures(key)[0]
         leg_m = lib.leg_length_m(row["fit_scale"])
         bands = lib.normal_bands(measures, leg_m)
         done, pace = video.conditions(fit.SessionFit.Trial & key), gdi.pace_of(key["gdi_method"])
@@ -257,8 +257,7 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
             continue
         trial = fit.load_trial(file_ref((fit.SessionFit.Trial & key).fetch1("trial_file")))
         references = validation.ReferenceKinematics
-        with stored_file(file_ref((references & key).fetch1("reference_file"))) as path:
-            truth = lib.Reference.load(path)
+        truth = read_stored(file_ref((references & key).fetch1("reference_file")), lib.Reference.load)
         for method in dict.fromkeys(r["gait_method"] for r in (gait.GaitCycle & key).proj().to_dicts()):
             of_method = {**key, "gait_method": method}
             cycles = [

@@ -6,8 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from pbl_pipeline.files import load_npz
 from pbl_pipeline.qc import in_order
 from pbl_pipeline.records import from_row
 from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, Kinetics, MovementProfile, Solution, TrialKinetics
@@ -15,7 +14,7 @@ from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, Kinetics, Movemen
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
 from ..rows import Rows, row_of, stored_rows
-from ..stored_files import file_ref, stored_file
+from ..stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -39,8 +38,7 @@ def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
     from pbl_pipeline.keypoints import Keypoints
 
     ref = file_ref(row_of(keypoints.Keypoints, _keys(key), rows)["keypoints_file"])
-    with stored_file(ref) as path:
-        return Keypoints.load(path)
+    return read_stored(ref, Keypoints.load)
 
 
 def load_trial_fit(key: Any, rows: Rows = stored_rows) -> TrialFit:
@@ -56,19 +54,12 @@ def _keys(key: Any) -> Any:
 def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     """The library's `Solution` of one row of SessionFit: how its body was fitted, without the fitted movements."""
     row = row_of(fit.SessionFit, _of(fit.SessionFit, key), rows)
-    with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
-        scale, trace = f["scale"], f["loss_trace"]
-    found = from_row(
-        Solution,
-        row,
-        params_hash=row["fit_method_hash"],
-        scale=scale,
-        loss_trace=trace,
-        seconds=float(row["fit_seconds"]),
-        software=row["fit_code_version"],
-    )
+    arrays = read_stored(file_ref(row["session_file"]), lambda path: load_npz(path, needed=("scale", "loss_trace")))
+    origin = {"params_hash": row["fit_method_hash"], "software": row["fit_code_version"], "seconds": row["fit_seconds"]}
+    found = from_row(Solution, row, **origin, **arrays)
     # NULL for fits older than this column: the trace ends with the last step
-    return found if found.iterations is not None else dataclasses.replace(found, iterations=int(trace[-1, 0]))
+    steps = found.loss_trace[-1, 0] if found.iterations is None else found.iterations
+    return dataclasses.replace(found, iterations=int(steps))
 
 
 def load_fit_checks(key: Any, rows: Rows = stored_rows) -> tuple[Check, ...]:
@@ -78,10 +69,7 @@ def load_fit_checks(key: Any, rows: Rows = stored_rows) -> tuple[Check, ...]:
 
 def load_tracking(key: Any) -> tracking_lib.Tracking:
     """The library's `Tracking` of one row."""
-    row = (tracking.Tracking & key).fetch1()
-    size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
-    with stored_file(file_ref(row["tracks"])) as path:
-        return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
+    return tracking.load_tracking(*tracking.tracks_of(key))
 
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
@@ -103,7 +91,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     measures = lib.Spatiotemporal(
         row["session_status"],
         row["session_reason"],
-        *_measures(gdi.SessionGdi.Measure, row_key, rows),
+        *gdi.SessionGdi.Measure.measures(row_key, lib.TRIAL_MEASURES, rows),
         n_cycles_found=sum(t.spatiotemporal.n_cycles_found for t in pooled),
         n_cycles_used=int(row["session_cycles"]),
         n_steps_used=sum(t.spatiotemporal.n_steps_used for t in pooled),
@@ -129,26 +117,16 @@ def _trial_metrics(key: Mapping[str, Any], pace: str, rows: Rows) -> lib.TrialMe
     of_trial = _of(gait.GaitEvents, key)
     row = {**row_of(gait.GaitCycle, of_trial, rows), **row_of(gait.Spatiotemporal, of_trial, rows)}
     events = load_events(of_trial, rows)
-    measures, reasons = _measures(gait.Spatiotemporal.Measure, of_trial, rows)
+    measures, reasons = gait.Spatiotemporal.Measure.measures(of_trial, lib.TRIAL_MEASURES, rows)
     measures = from_row(lib.Spatiotemporal, row, measures=measures, reasons=reasons)
-    cycles = tuple(load_cycles(of_trial, name, rows))
+    cycles = load_cycles(of_trial, name, rows)
     sides = {c.number: c.side for c in cycles}
     scores = rows(gdi.GDI.Cycle, key)
     scored = [from_row(GdiCycle, r, trial=name, side=sides[int(r["cycle_no"])]) for r in scores]
     checks = in_order(gdi.GDI.Check.records(key, rows))
     index = _index(gdi.GDI, row_of(gdi.GDI, key, rows), "gdi", scored, rows, qc=checks)
-    reason = events.reason or measures.reason
-    return lib.TrialMetrics(
-        name=name,
-        status="EMPTY" if reason else "PASS",
-        reason=reason,
-        events=events,
-        cycles=cycles,
-        spatiotemporal=measures,
-        gdi=index,
-        qc=(*events.qc, *lib.cycle_checks(measures, cycles), *index.qc),
-        pooled=video.condition(key["video_id"], rows).pooled(pace),
-    )
+    pooled = video.condition(key["video_id"], rows).pooled(pace)
+    return lib.TrialMetrics.of(name, events, cycles, measures, index, pooled)
 
 
 def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics | None:
@@ -161,13 +139,12 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
         return None
     row = max(computed, key=lambda r: r["forces_computed"])
     row_key = _of(kinetics.Kinetics, row)
-    stored = kinetics.Kinetics.Measure.measures(row_key, rows)
-    found = {n: stored[n] for n in lib.MEASURES if n in stored}
+    measures, reasons = kinetics.Kinetics.Measure.measures(row_key, lib.MEASURES, rows)
     return from_row(
         Kinetics,
         row,
-        measures={n: m for n, (m, _) in found.items() if m is not None},
-        reasons={n: why for n, (m, why) in found.items() if m is None},
+        measures={n: m for n, m in measures.items() if m is not None},
+        reasons=reasons,
         method=row["kinetics_method"],
         params_hash=row["forces_method_hash"],
         trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
@@ -182,8 +159,7 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
 
     series, curves = None, {}
     if row["trial_forces"] is not None:
-        with stored_file(file_ref(row["trial_forces"])) as path:
-            series, curves = load_arrays(path)
+        series, curves = read_stored(file_ref(row["trial_forces"]), load_arrays)
     cycles = {r["cycle_no"]: r for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
 
     def cycle(own: Mapping[str, Any]) -> CycleKinetics:
@@ -230,12 +206,3 @@ def _index(table: Any, row: Mapping[str, Any], prefix: str, cycles: Sequence[Gdi
         profile=profile,
         **more,
     )
-
-
-def _measures(part: Any, key: Mapping[str, Any], rows: Rows) -> tuple[dict[str, Any], dict[str, str]]:
-    """Measures of a result by their part table, in the library's order, and why one is not known."""
-    from pbl_pipeline import gait as lib
-
-    found = part.measures(key, rows)
-    found = {n: found[n] for n in (*lib.TRIAL_MEASURES, *found) if n in found}
-    return {n: m for n, (m, _) in found.items()}, {n: why for n, (_, why) in found.items() if why}

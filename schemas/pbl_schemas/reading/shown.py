@@ -256,8 +256,8 @@ def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]
     """Return each measure of a result by its name, with the reason where it is not known."""
     from pbl_pipeline.words import MEASURES
 
-    found = gdi.SessionGdi.Measure.measures(key)
-    return {n: found[n] for n in MEASURES if n in found}
+    measures, reasons = gdi.SessionGdi.Measure.measures(key)
+    return {n: (measures[n], reasons.get(n, "")) for n in MEASURES if n in measures}
 
 
 def _tasks_of(

@@ -25,7 +25,7 @@ from ..jobs import jobs_of
 from ..method_names import with_keys
 from ..operations.archive import plain_name
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
-from ..stored_files import file_ref, stored_file
+from ..stored_files import file_ref, read_stored
 from .objects import (
     load_fit_checks,
     load_keypoints,
@@ -300,8 +300,7 @@ def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLo
     stored = rows(video.PhoneAttitude, {"video_id": number})
     if not stored:
         return None
-    with stored_file(file_ref(stored[0]["attitude_file"])) as path:
-        log = read_phone_log(path)
+    log = read_stored(file_ref(stored[0]["attitude_file"]), read_phone_log)
     return log, log_shift_s(log, load_keypoints(points, rows), f"video {number}")
 
 

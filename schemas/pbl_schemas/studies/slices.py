@@ -26,7 +26,7 @@ from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..reading.slice_rows import slice_row
 from ..rows import PART, insert_in_parts, inside, rows_inside, utc_now
-from ..stored_files import file_ref, stored_file
+from ..stored_files import file_ref, read_stored
 from ..transactions import in_transaction
 
 if TYPE_CHECKING:
@@ -473,10 +473,9 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
         sides = used[r["fit_set"], number]
         if not sides or not done[number].pooled(pace):
             continue
-        with stored_file(file_ref(r["curves"])) as path:
-            by_cycle = load_curves(path)
+        by_cycle = read_stored(file_ref(r["curves"]), load_curves)
         for n, side in sides.items():
-            for angle, curve in by_cycle[n].deg.items():
+            for angle, curve in by_cycle[n].curves.items():
                 found[r["fit_set"], side, angle].append(curve)
     out, points = [], []
     for (fit_set, side, angle), curves in found.items():
