@@ -151,3 +151,8 @@ def undo_0010(cursor: Any) -> None:
 def undo_0012(cursor: Any) -> None:
     """Forget the segments of wearable sensors."""
     cursor.execute("ALTER TABLE pbl_video.wearable_imu DROP COLUMN imu_rate, DROP COLUMN imu_segments")
+
+
+def undo_0013(cursor: Any) -> None:
+    """Forget the use of GPUs."""
+    cursor.execute("ALTER TABLE pbl_worker.worker DROP COLUMN worker_gpus")

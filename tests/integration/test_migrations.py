@@ -31,6 +31,7 @@ from pbl_schemas import (
     tables_version,
     validation,
     video,
+    worker,
 )
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.decisions import event_corrections, review_decisions
@@ -176,6 +177,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0013,
         older_tables.undo_0012,
         older_tables.undo_0010,
         older_tables.undo_0009,
@@ -378,6 +380,7 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert {"session_gdi_unshrunk", "session_gdi_unshrunk_sd"} < set(gdi.SessionGdi.heading.names)
     assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert {"imu_segments", "imu_rate"} < set(video.WearableImu.heading.names)
+    assert "worker_gpus" in worker.Worker.heading.names
     assert migrations.migrate().steps == []
 
 

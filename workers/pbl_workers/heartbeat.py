@@ -7,6 +7,7 @@ which free the reservations of dead ones (`recover`), and to `pbl status`.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import platform
 import secrets
@@ -19,6 +20,7 @@ import pymysql
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import gpu_use
 from pbl_schemas import connection, worker
 from pbl_schemas.connection import dj
 
@@ -90,6 +92,7 @@ class Heartbeat(Silent):
         if self._connection is None:
             self._connection = connection.another()
         run, now = self._connection.query, "CURRENT_TIMESTAMP(3)"
+        gpus = None if last or self.resource != worker.SUPERVISOR else gpu_use()
         table, minutes = worker.Worker.full_table_name, worker.Throughput.full_table_name
         with self._lock:
             doing, counts = self._doing, {k: tuple(v) for k, v in self._counts.items()}
@@ -105,8 +108,9 @@ class Heartbeat(Silent):
                 self._registered = True
             stopped = f", worker_stopped={now}" if last else ""
             run(
-                f"UPDATE {table} SET worker_seen={now}, worker_doing=%s{stopped} WHERE worker=%s",  # noqa: S608
-                args=(doing, self.worker),
+                f"UPDATE {table} SET worker_seen={now}, worker_doing=%s, worker_gpus=%s{stopped}"  # noqa: S608
+                " WHERE worker=%s",
+                args=(doing, None if gpus is None else json.dumps(gpus), self.worker),
             )
             minute = f"DATE_FORMAT({now}, '%%Y-%%m-%%d %%H:%%i:00')"
             while counts:

@@ -133,6 +133,30 @@ class Cron:
 
 
 @dataclasses.dataclass(frozen=True)
+class Machine:
+    """A machine with live workers. gpus: its GPUs, as `resources.gpu_use` has them, None: not known. resting: of each
+    worker, which of its processes wait after they died."""
+
+    host: str
+    gpus: list[dict[str, Any]] | None = None
+    resting: list[str] = dataclasses.field(default_factory=list)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """For people: what it is about, and its state."""
+        out = [(f"worker {self.host}", text) for text in self.resting]
+        if self.gpus is None:
+            return [*out, (f"GPUs of {self.host}", "unknown")]
+        for gpu in self.gpus:
+            busy, used, size = (gpu.get(name) for name in ("busy", "used", "size"))
+            use = "use unknown" if busy is None else f"{busy:.0%} busy"
+            memory = (
+                "memory unknown" if used is None or size is None else f"{used / 1e9:.1f} of {size / 1e9:.1f} GB used"
+            )
+            out.append((f"GPU {gpu['gpu']} of {self.host}", f"{use}, {memory}"))
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
 class Status:
     """The whole state."""
 
@@ -152,6 +176,7 @@ class Status:
     disks: list[tuple[str, float, float]] = dataclasses.field(default_factory=list)
     #: Ages (s) and lengths (byte) of what lies in the archive of this machine without being registered.
     unfinished: list[tuple[float, int]] = dataclasses.field(default_factory=list)
+    machines: list[Machine] = dataclasses.field(default_factory=list)
 
 
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
@@ -191,6 +216,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         cron_passes(server),
         disks(),
         [(time.time() - one.last_s, one.n_bytes) for one in unfinished(archive_dir())],
+        machines(),
     )
 
 
@@ -272,19 +298,36 @@ def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
     return {str(stage): 3600.0 * float(n) / max(float(seconds), 60.0) for stage, n, seconds in rows}
 
 
-def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
+#: Condition on rows of `Worker`: their heartbeat is recent.
+_ALIVE = "worker_stopped IS NULL AND worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL 60 SECOND"
+#: And: they take jobs.
+_TAKES_JOBS = f"worker_resource NOT IN ('{worker.CRON}', '{worker.SUPERVISOR}')"
+
+
+def live_workers() -> list[dict[str, Any]]:
     """Return the workers with a recent heartbeat: host, process, resource, current job."""
-    alive = worker.Worker & "worker_stopped IS NULL" & f"worker_resource != '{worker.CRON}'"
-    alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
     names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
+    alive = worker.Worker & _ALIVE & _TAKES_JOBS
     return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def machines() -> list[Machine]:
+    """Return the machines on which workers live, by name."""
+    out: dict[str, Machine] = {}
+    alive = worker.Worker & _ALIVE & f"worker_resource != '{worker.CRON}'"
+    for row in alive.to_dicts(order_by="worker_host, worker_seen"):
+        host, of_supervisor = str(row["worker_host"]), row["worker_resource"] == worker.SUPERVISOR
+        known = out.get(host, Machine(host))
+        resting = [*known.resting, row["worker_doing"]] if of_supervisor and row["worker_doing"] else known.resting
+        out[host] = Machine(host, known.gpus if row["worker_gpus"] is None else row["worker_gpus"], resting)
+    return list(out.values())
 
 
 def worker_counts(server: Any) -> tuple[int, int]:
     """Return the numbers of workers that live, and of those whose heartbeat ended within the last hour without that
     they did in order."""
     silent = f"TIMESTAMPDIFF(SECOND, worker_seen, CURRENT_TIMESTAMP) FROM {worker.Worker.full_table_name}"
-    rows = server.query(f"SELECT {silent} WHERE worker_stopped IS NULL AND worker_resource != %s", args=(worker.CRON,))
+    rows = server.query(f"SELECT {silent} WHERE worker_stopped IS NULL AND {_TAKES_JOBS}")
     ages = [float(age) for (age,) in rows.fetchall()]
     return sum(age < LOST_S for age in ages), sum(LOST_S <= age < 3600.0 for age in ages)
 
