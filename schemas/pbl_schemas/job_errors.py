@@ -11,6 +11,7 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said, said_of
+from pbl_pipeline.names import shortened
 
 from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, LONGER, REPEAT, TOO_LONG, LostConnectionError
 
@@ -28,10 +29,10 @@ def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
     about = error.key if error.key is not None else ", ".join(f"{k}={v}" for k, v in key.items())
     return PblError(
         error.code,
-        found=_cut(error.found, _LIMITS["found"]),
-        expected=_cut(error.expected, _LIMITS["expected"]),
-        next_step=_cut(error.next_step, _LIMITS["next_step"]),
-        key=_cut(str(about), _LIMITS["key"]),
+        found=shortened(error.found, _LIMITS["found"]),
+        expected=shortened(error.expected, _LIMITS["expected"]),
+        next_step=shortened(error.next_step, _LIMITS["next_step"]),
+        key=shortened(str(about), _LIMITS["key"]),
     )
 
 
@@ -41,7 +42,7 @@ def store_full(error: BaseException) -> PblError | None:
         if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
             return PblError(
                 "STORE_FULL",
-                found=_cut(f"{type(seen).__name__}: {seen}", _LIMITS["found"]),
+                found=shortened(f"{type(seen).__name__}: {seen}", _LIMITS["found"]),
                 expected="room for arrays and temporary files",
                 next_step="free space, or give the store's disk or bucket more; jobs that met it go on by themselves",
             )
@@ -91,15 +92,11 @@ def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblErr
     about = f"{table} " + ", ".join(f"{k}={v}" for k, v in key.items())
     return PblError(
         "INTERNAL",
-        found=_cut(f"{type(error).__name__}: {error}", _LIMITS["found"]),
+        found=shortened(f"{type(error).__name__}: {error}", _LIMITS["found"]),
         expected="a result or a coded error",
         next_step=_REPORT,
-        key=_cut(about, _LIMITS["key"]),
+        key=shortened(about, _LIMITS["key"]),
     )
-
-
-def _cut(text: str, limit: int) -> str:
-    return text if len(text) <= limit else text[: limit - 4] + " ..."
 
 
 def of_job(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
@@ -120,7 +117,7 @@ def as_text(error: PblError, longest: int) -> str:
         if isinstance(data[part], dict):
             data[part] = str(said_of(data[part]))
         else:
-            data[part] = _cut(data[part], int(0.9 * len(data[part])))
+            data[part] = shortened(data[part], int(0.9 * len(data[part])))
     return text
 
 

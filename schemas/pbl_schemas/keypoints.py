@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline import methods
+from pbl_pipeline.names import shortened
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import from_row, number
 from pbl_pipeline.results.video_facts import Intrinsics
@@ -62,11 +63,11 @@ class Keypoints(dj.Computed):
     n_seen                : int32              # frames with at least one point
     median_confidence=null: float64            # (0..1) median over the points that were seen, null when none was
     camera_kind           : enum('file', 'measured', 'metadata', 'preset', 'guess', 'other')  # where the intrinsics come from
-    camera_source         : varchar(255)       # the same in words
+    camera_source         : varchar(1000)      # the same in words
     focal_length          : float64            # (px) mean of fx and fy
     focal_rel_sd=null     : float64            # (1) standard deviation of the focal length as a share of it, null when unknown
     keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
-    phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
+    phone_log=null        : varchar(1000)      # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     index (camera_kind)
     {origin_columns("keypoints")}
@@ -156,11 +157,11 @@ class Keypoints(dj.Computed):
                     "n_seen": int(seen.any(axis=1).sum()),
                     "median_confidence": number(np.median(found.confidence[seen])) if seen.any() else None,
                     "camera_kind": found.camera.kind,
-                    "camera_source": found.camera.source[:255],
+                    "camera_source": shortened(found.camera.source, 1000),
                     "focal_length": found.camera.focal_px,
                     "focal_rel_sd": number(found.camera.focal_rel_sd),
                     "keypoints_camera_id": camera_id,
-                    "phone_log": None if log is None else log[:255],
+                    "phone_log": None if log is None else shortened(log, 1000),
                     "keypoints_file": folder / "keypoints.npz",
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }
@@ -175,5 +176,5 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     c = from_row(Intrinsics, row)
     matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
     rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
-    camera = Camera(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
+    camera = Camera(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}", rel_sd)
     return turned_camera(camera, (c.width_px, c.height_px), row["turn_deg"])

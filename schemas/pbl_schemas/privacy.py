@@ -12,6 +12,7 @@ import numpy as np
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
+from pbl_pipeline.names import shortened
 from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from . import video
@@ -34,7 +35,7 @@ class Deidentified(dj.Computed):
     ---
     deidentified_how         : enum('blur', 'pixelate', 'skeleton')  # how heads are hidden; skeleton: keypoints on black
     deidentified_status      : enum('CERTAIN', 'REVIEW', 'NO_HEAD')  # REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered
-    deidentified_reason      : varchar(255)     # the status in words
+    deidentified_reason      : varchar(1000)    # the status in words
     deidentified_heads       : int32            # heads that were found, false ones included
     deidentified_uncertain   : int32            # frames that are not certain
     deidentified_ranges      : json             # runs of these: first and last frame (from 0), and why
@@ -87,7 +88,7 @@ class Deidentified(dj.Computed):
         row = {
             "how": done.how,
             "status": done.status,
-            "reason": done.reason[:255],
+            "reason": shortened(done.reason, 1000),
             "heads": done.n_heads,
             "uncertain": done.n_uncertain,
             "ranges": [{"first": a, "last": b, "why": list(done.why(a, b))} for a, b in done.uncertain],

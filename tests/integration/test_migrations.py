@@ -177,6 +177,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0014,
         older_tables.undo_0013,
         older_tables.undo_0012,
         older_tables.undo_0010,
@@ -381,6 +382,7 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert {"imu_segments", "imu_rate"} < set(video.WearableImu.heading.names)
     assert "worker_gpus" in worker.Worker.heading.names
+    assert "varchar(1000)" in gait.Spatiotemporal.Measure.heading["measure_missing"].original_type
     assert migrations.migrate().steps == []
 
 

@@ -20,6 +20,7 @@ import pymysql
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import shortened
 from pbl_pipeline.resources import gpu_use
 from pbl_schemas import connection, worker
 from pbl_schemas.connection import dj
@@ -70,7 +71,7 @@ class Heartbeat(Silent):
     def doing(self, what: str) -> None:
         """Report the current job; written with the next beat."""
         with self._lock:
-            self._doing = what[:500]
+            self._doing = shortened(what, 500)
 
     def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
         """Add finished jobs; written with the next beat."""
