@@ -41,7 +41,7 @@ def shortened(text: str, longest: int) -> str:
         return text
     room = max(0, longest - len(" ..."))
     words = text[: room + 1].rpartition(" ")[0]
-    return f"{words if 2 * len(words) > room else text[:room]} ..."[:longest]
+    return f"{words if 2 * len(words) >= room else text[:room]} ..."[:longest]
 
 
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:

@@ -32,7 +32,7 @@ class Worker(dj.Manual):
     worker_seen     : datetime(3)              # last heartbeat, clock of the database server
     worker_stopped=null : datetime(3)          # when it ended in order
     worker_doing    : varchar(500)             # table and key in hand, or why it waits
-    worker_gpus=null : json                    # of a supervisor: use and memory of the GPUs of its machine; null: not known
+    worker_gpus=null : json                    # of a supervisor: use of the GPUs of its machine; null: not known
     """
 
 

@@ -9,5 +9,5 @@ from ._columns import added
 
 def statements(conn: Any) -> list[str]:
     """The column `worker_gpus` of Worker: null, not known, of workers of before."""
-    comment = "of a supervisor: use and memory of the GPUs of its machine; null: not known"
+    comment = "of a supervisor: use of the GPUs of its machine; null: not known"
     return added(conn, "worker", "worker", {"worker_gpus": ("json", comment, "worker_doing")})
