@@ -27,13 +27,8 @@ _REPORT = "report this with the error stack that `pbl status --json` prints"
 def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
     """Return the same error, cut to fit the job's error row, with the job's key where it has none."""
     about = error.key if error.key is not None else ", ".join(f"{k}={v}" for k, v in key.items())
-    return PblError(
-        error.code,
-        found=shortened(error.found, _LIMITS["found"]),
-        expected=shortened(error.expected, _LIMITS["expected"]),
-        next_step=shortened(error.next_step, _LIMITS["next_step"]),
-        key=shortened(str(about), _LIMITS["key"]),
-    )
+    whole = {"found": error.found, "expected": error.expected, "next_step": error.next_step, "key": str(about)}
+    return PblError(error.code, **{part: shortened(text, _LIMITS[part]) for part, text in whole.items()})
 
 
 def store_full(error: BaseException) -> PblError | None:
@@ -90,12 +85,8 @@ def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblErr
     if (full := store_full(error)) is not None:
         return fitted(full, key)
     about = f"{table} " + ", ".join(f"{k}={v}" for k, v in key.items())
-    return PblError(
-        "INTERNAL",
-        found=shortened(f"{type(error).__name__}: {error}", _LIMITS["found"]),
-        expected="a result or a coded error",
-        next_step=_REPORT,
-        key=shortened(about, _LIMITS["key"]),
+    return fitted(
+        PblError("INTERNAL", f"{type(error).__name__}: {error}", "a result or a coded error", _REPORT, about), key
     )
 
 

@@ -210,7 +210,7 @@ def test_gpus_and_resting_processes_are_shown_of_live_workers(
             shown = " ".join(pbl(*command).out.replace(": ", " ").split())
             assert f"worker {platform.node()} process 2 (GPU 1) starts again 8 s after it died" in shown
             assert f"GPU 0 of {platform.node()} 37% busy, 1.0 of 2.1 GB used" in shown
-            assert f"GPU 1 of {platform.node()} use unknown, 0.0 of 2.1 GB used" in shown
+            assert f"GPU 1 of {platform.node()} 0.0 of 2.1 GB used" in shown
         found = {m["host"]: m["gpus"] for m in json.loads(pbl("status", "--json").out)["machines"]}
         assert found["alive"] is None
         assert found[platform.node()][1] == {"gpu": "1", "used": 0.0, "size": 2000 * 2**20}

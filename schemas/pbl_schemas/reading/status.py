@@ -147,12 +147,13 @@ class Machine:
         if self.gpus is None:
             return [*out, (f"GPUs of {self.host}", "unknown")]
         for gpu in self.gpus:
-            busy, used, size = (gpu.get(name) for name in ("busy", "used", "size"))
-            use = "use unknown" if busy is None else f"{busy:.0%} busy"
-            memory = (
-                "memory unknown" if used is None or size is None else f"{used / 1e9:.1f} of {size / 1e9:.1f} GB used"
+            use = [f"{gpu['busy']:.0%} busy"] if "busy" in gpu else []
+            use += (
+                [f"{gpu['used'] / 1e9:.1f} of {gpu['size'] / 1e9:.1f} GB used"]
+                if {"used", "size"} <= gpu.keys()
+                else []
             )
-            out.append((f"GPU {gpu['gpu']} of {self.host}", f"{use}, {memory}"))
+            out.append((f"GPU {gpu['gpu']} of {self.host}", ", ".join(use) or "unknown"))
         return out
 
 
