@@ -59,16 +59,27 @@ def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, faults, l
     job = first_job(tmp_path)
     limits(run_job, DATABASE_WAIT_S=0.05)
     faults(video.VideoInfo, "make_insert", *[FULL] * 1000)
-    assert run_job.run(job).what == run_job.LATER
+    outcome = run_job.run(job)
+    assert (outcome.what, outcome.code) == (run_job.LATER, "DB_REFUSED")
     assert recover.free_dead(video.VideoInfo) == 1  # what it let go
     assert video.VideoInfo.jobs.fetch1("status", "deaths") == ("pending", 0)
+
+
+def test_a_database_that_stays_away_is_no_unforeseen_error(tmp_path: Path, faults, limits: Limits):
+    job = first_job(tmp_path)
+    limits(run_job, DATABASE_WAIT_S=0.05)
+    away = pymysql.err.OperationalError(2003, "Can't connect to the server")
+    faults(video.VideoInfo, "make_insert", *[away] * 1000)
+    outcome = run_job.run(job)
+    assert (outcome.what, outcome.code) == (run_job.LATER, "DB_NOT_RUNNING")
 
 
 def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, faults):
     job = first_job(tmp_path)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
     faults(video.VideoInfo, "make_insert", *[deadlock] * 1000)
-    assert run_job.run(job).what == run_job.LATER
+    outcome = run_job.run(job)
+    assert (outcome.what, outcome.code) == (run_job.LATER, "DB_REFUSED")
     assert video.VideoInfo.jobs.fetch1("status") == "pending"
     assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
 

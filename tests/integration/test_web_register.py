@@ -393,6 +393,12 @@ def test_recordings_are_taken_into_the_archive_and_queued(tmp_path: Path, archiv
     again = upload(browser, first)
     assert "was registered before" in again.text
     assert len(video.Video()) == 2
+    # With the phone's log beside it, that is added: where the check of the vertical sends a reader.
+    log = "time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200))
+    upload(browser, first, ("walk.csv", log.encode()))
+    (kept,) = video.PhoneAttitude().to_dicts()
+    assert (kept["video_id"], kept["attitude_n"], len(video.Video())) == (rows[0]["video_id"], 200, 2)
+    assert kept["attitude_size"] == len(log)
 
 
 @pytest.mark.parametrize(

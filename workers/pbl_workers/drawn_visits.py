@@ -46,7 +46,7 @@ def register_drawn(folder: Path) -> list[int]:
     folder.mkdir(parents=True, exist_ok=True)
     for seed, (subject, (height_m, mass_kg, visits)) in enumerate(PERSONS.items()):
         for visit, ((role, day), (impairment, mjoa, speed)) in enumerate(zip(VISITS.items(), visits, strict=True)):
-            path = folder / f"{subject}_{role}.npz"
+            path = folder / f"{subject} {day}.npz"
             markers(seed, visit, impairment, float(speed)).save(path)
             stated = VisitRecord(subject, str(day), PROJECT, height_m=height_m, mass_kg=mass_kg, pace="self_selected")
             recordings.append(LaboratoryMarkers(path, stated))

@@ -18,7 +18,7 @@ from pbl_pipeline.errors import PblError, causes
 from pbl_schemas import connection
 from pbl_schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
 from pbl_schemas.datajoint_setup import AWAY, FULL, REPEAT
-from pbl_schemas.job_errors import error_message, of_job
+from pbl_schemas.job_errors import error_message, of_database, of_job
 from pbl_schemas.jobs import keys_of
 from pbl_schemas.rows import InputChanged, exist
 from pbl_schemas.stored_files import remove_left_over
@@ -173,6 +173,8 @@ def _wanted(job: Claim) -> Any:
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
+    if what == LATER and not isinstance(error, PblError):
+        error = of_database(error) or error  # what puts a job back is no fault of it
     coded = of_job(error, job.table.__name__, job.key)
     return Outcome(job, what, code=coded.code, text=coded.text())
 
