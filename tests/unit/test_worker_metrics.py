@@ -377,8 +377,9 @@ def of_gpus(folder: Path, *gpus: str, **options: Any) -> Supervisor:
     """A worker with a process for each GPU, which it ends as `gpu_by_name` says."""
     given = Options("gpu", len(gpus), gpus=gpus, selftest=False, profile=str(folder), **options)
     boss = Supervisor(given, target=gpu_by_name.work)
-    boss._start = multiprocessing.get_context("forkserver")  # imports once what all need
-    boss._start.set_forkserver_preload([gpu_by_name.__name__])
+    once: Any = multiprocessing.get_context("forkserver")  # imports once what all need
+    once.set_forkserver_preload([gpu_by_name.__name__])
+    boss._start = once
     return boss
 
 

@@ -148,11 +148,8 @@ class Machine:
             return [*out, (f"GPUs of {self.host}", "unknown")]
         for gpu in self.gpus:
             use = [f"{gpu['busy']:.0%} busy"] if "busy" in gpu else []
-            use += (
-                [f"{gpu['used'] / 1e9:.1f} of {gpu['size'] / 1e9:.1f} GB used"]
-                if {"used", "size"} <= gpu.keys()
-                else []
-            )
+            if {"used", "size"} <= gpu.keys():
+                use.append(f"{gpu['used'] / 1e9:.1f} of {gpu['size'] / 1e9:.1f} GB used")
             out.append((f"GPU {gpu['gpu']} of {self.host}", ", ".join(use) or "unknown"))
         return out
 
