@@ -90,10 +90,8 @@ class _Place:
         self.why, self.until = why, time.monotonic() + self.pause_s
 
     def __str__(self) -> str:
-        pause = (
-            f"starts again {self.pause_s:g} s after it died" if math.isfinite(self.until) else "is not started again"
-        )
-        return f"{self.name} {pause}: {self.why}{f', {self.deaths} times in a row' if self.deaths > 1 else ''}"
+        then = f"starts again {self.pause_s:g} s after it died" if self.until < math.inf else "is not started again"
+        return f"{self.name} {then}: {self.why}{f', {self.deaths} times in a row' if self.deaths > 1 else ''}"
 
 
 class Supervisor:
@@ -292,8 +290,6 @@ _EXITS = {SELFTEST_FAILED: "its self-test failed", DEVICE_FAILED: "its GPU does 
 
 
 def _death(exit_code: int) -> str:
-    if exit_code in _EXITS:
-        return _EXITS[exit_code]
     if exit_code < 0:
         return f"signal {signal.Signals(-exit_code).name}"
-    return f"exit code {exit_code}"
+    return _EXITS.get(exit_code, f"exit code {exit_code}")

@@ -441,17 +441,8 @@ def _errors(table: Any, most: int) -> list[ErrorRow]:
     out, jobs = [], jobs_of(table)
     for key, about, row in _keyed(jobs, jobs.errors.to_dicts(limit=most)):
         error = stored_error(row["error_message"])
-        out.append(
-            ErrorRow(
-                table=table.__name__,
-                key=key,
-                about=about,
-                code=error.code,
-                found=error.found,
-                next_step=error.next_step,
-                stack=str(row["error_stack"] or ""),
-            )
-        )
+        said = (error.code, error.found, error.next_step)
+        out.append(ErrorRow(table.__name__, key, about, *said, str(row["error_stack"] or "")))
     return out
 
 
@@ -479,14 +470,7 @@ def _waiting(most: int) -> list[Waiting]:
     for row in rows:
         key = {k: row[k] for k in ("video_id", "tracking_method")}
         persons = sorted(seen.get((int(row["video_id"]), row["tracking_method"]), []))
-        out.append(
-            Waiting(
-                video_id=int(row["video_id"]),
-                about=row["video_name"],
-                reason=row["choice_reason"],
-                persons=persons,
-                next_step=tracking.choose_command(key, "|".join(map(str, persons)), several),
-                look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
-            )
-        )
+        choose = tracking.choose_command(key, "|".join(map(str, persons)), several)
+        look = f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg"
+        out.append(Waiting(int(row["video_id"]), row["video_name"], row["choice_reason"], persons, choose, look))
     return out
