@@ -233,7 +233,7 @@ class Supervisor:
             elif exit_code and not self._stopping:
                 event(log, logging.ERROR, "process died", exit_code=exit_code, reason=_death(exit_code))
             if self._stopping or (exit_code == 0 and not child.jobs):
-                code = max(code, 1 if exit_code > 0 else 0)
+                code = max(code, int(exit_code > 0 and exit_code != DEVICE_FAILED))
                 del self._places[child.number]
                 continue
             place.rest(_death(exit_code), healthy, bool(child.jobs))
