@@ -15,6 +15,7 @@ import functools
 import gc
 import importlib
 import importlib.util
+import inspect
 import os
 import shutil
 import sys
@@ -125,7 +126,7 @@ class _Changes:
 
     def setattr(self, where: Any, name: str, value: object) -> None:
         where = importlib.import_module(where) if isinstance(where, str) else where
-        before = vars(where)[name] if isinstance(where, type) else getattr(where, name)
+        before = inspect.getattr_static(where, name) if isinstance(where, type) else getattr(where, name)
         self.end.callback(self._patch.setattr, where, name, before)
         self._patch.setattr(where, name, value)
 

@@ -35,6 +35,15 @@ def normalised_label(text: str) -> str:
     return normalize("NFC", _SPACES.sub(" ", text).strip(" "))
 
 
+def shortened(text: str, longest: int) -> str:
+    """Return a text in words of at most so many characters: of a longer one the first words, and an ellipsis."""
+    if len(text) <= longest:
+        return text
+    room = max(0, longest - len(" ..."))
+    words = text[: room + 1].rpartition(" ")[0]
+    return f"{words if 2 * len(words) >= room else text[:room]} ..."[:longest]
+
+
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
     """Refuse a label with control characters, or of another length. `what` names it in the error.
 

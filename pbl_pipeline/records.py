@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from pbl_pipeline.names import check_label
+from pbl_pipeline.names import check_label, shortened
 from pbl_pipeline.paramset import structured
 
 T = TypeVar("T")
@@ -36,7 +36,8 @@ class Column(NamedTuple):
     type: str = "float64"  # of DataJoint, such as varchar(64)
     null: bool = False  # NULL for None, "" and what is not finite; always so where the field may be None
     old: str | None = None  # value in the rows that were there when it was added
-    cut: bool = False  # text in words, which is cut to its length; of a name that is too long `to_row` raises
+    # Text in words, which is shortened; "tag": of a file, cut without an ellipsis. Of a name `to_row` raises.
+    cut: bool | str = False
     key: bool = False  # in the primary key of the table
     digits: int | None = None  # decimals of the numbers of a json column
     meaning: str = ""  # in words, for files
@@ -238,7 +239,8 @@ def _writer(c: Column) -> Callable[[Any], Any]:
     kind: Callable[[Any], Any] = {"int": int, "bool": bool}.get(c.type.rstrip("0123456789"), _same)
     if c.type.startswith("varchar"):
         longest, name = int(c.type[8:-1]), c.name.format("").strip("_")
-        kind = (lambda text: str(text)[:longest]) if c.cut else functools.partial(_name, name, longest)
+        cut = (lambda text: str(text)[:longest]) if c.cut == "tag" else lambda text: shortened(str(text), longest)
+        kind = cut if c.cut else functools.partial(_name, name, longest)
     return (lambda value: None if value is None or value == "" else kind(value)) if c.null else kind
 
 

@@ -107,21 +107,42 @@ def processes_at_once(gpu_detects: bool) -> int:
     return max(1, min((2 if gpu_detects else 1) * cores(), memory_bytes() // (4 << 30)))
 
 
-def gpus(*columns: str) -> list[list[str]]:
-    """Index and these columns of `nvidia-smi` of each GPU of the machine, as text; none without an NVIDIA driver."""
+def _gpus(*columns: str) -> list[list[str]] | None:
+    """Index and these columns of `nvidia-smi` of each GPU of the machine, as text; none without an NVIDIA driver, None
+    if it does not answer."""
     query = ["nvidia-smi", f"--query-gpu={','.join(('index', *columns))}", "--format=csv,noheader,nounits"]
     try:
         done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
-    except (OSError, subprocess.SubprocessError):
+    except OSError:
         return []
+    except subprocess.SubprocessError:
+        return None
     return [[cell.strip() for cell in line.split(",")] for line in done.stdout.splitlines()]
+
+
+#: Figures of a GPU: the column of `nvidia-smi`, and what its values are multiplied by.
+_USE = {"busy": ("utilization.gpu", 0.01), "used": ("memory.used", 2**20), "size": ("memory.total", 2**20)}
+
+
+def gpu_use() -> list[dict[str, Any]] | None:
+    """Return of each NVIDIA GPU of the machine its index as `gpu`, the fraction of time that it is `busy`, and its
+    memory `used` and `size` (byte), without what it does not measure. None: the driver does not answer."""
+    found = _gpus(*(column for column, _ in _USE.values()))
+    if found is None:
+        return None
+    out: list[dict[str, Any]] = [{"gpu": index} for index, *_ in found]
+    for one, (_, *values) in zip(out, found, strict=True):
+        for (name, (_, unit)), value in zip(_USE.items(), values, strict=False):
+            with contextlib.suppress(ValueError):  # "[N/A]"
+                one[name] = float(value) * unit
+    return out
 
 
 def given_gpus() -> tuple[str, ...]:
     """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
     none if there is no NVIDIA driver."""
     listed = os.environ.get(VISIBLE_GPUS)
-    names = [row[0] for row in gpus()] if listed is None else map(str.strip, listed.split(","))
+    names = [row[0] for row in _gpus() or []] if listed is None else map(str.strip, listed.split(","))
     return tuple(itertools.takewhile(lambda name: name not in ("", "-1", "NoDevFiles"), names))
 
 

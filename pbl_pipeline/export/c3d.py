@@ -11,6 +11,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
+from pbl_pipeline.names import shortened
 from pbl_pipeline.video import SENSORS
 
 from . import plug_in_gait
@@ -61,7 +62,7 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     if name:
         file.add("SUBJECTS", "NAMES", [name])
     for key, value in origin.items():
-        file.add("PBL", key.upper(), [value[:250]])
+        file.add("PBL", key.upper(), [shortened(value, 250)])
     file.add("PBL", "TIMES", ["interpolated to an even rate" if even.resampled else "as filmed"])
     file.low.header().firstFrame(even.first)
     # ezc3d's `write` expects the masks as bool and leaks the memory of their conversion, 0.4 MB for 8 s of 33 points.

@@ -83,7 +83,7 @@ class Lengths:
     step_length_m: float | None = column("cycle_step_length", "(m) of the step that ends the cycle", default=None)
     step_width_m: float | None = column("cycle_step_width", "(m) null unless the metres were measured", default=None)
     missing: str = column(
-        "cycle_lengths_missing", "why there are no lengths", "varchar(150)", old="", cut=True, default=""
+        "cycle_lengths_missing", "why there are no lengths", "varchar(1000)", old="", cut=True, default=""
     )
     metric: bool = column(
         "cycle_lengths_metric",
@@ -123,7 +123,7 @@ class GaitCycle:
     end_s: float = column("cycle_end", "(s) next foot down of the same side")
     exclusion: Exclusion = dataclasses.field(default_factory=Exclusion)
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
-    curves_missing: str = column("curves_missing", "why it has no curves", "varchar(100)", cut=True, default="")
+    curves_missing: str = column("curves_missing", "why it has no curves", "varchar(1000)", cut=True, default="")
     curves_sd: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES

@@ -62,7 +62,7 @@ class CycleKinetics:
     curves: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_sd: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     measures: Mapping[str, float] = dataclasses.field(default_factory=dict)  # the known ones of `kinetics.MEASURES`
-    missing: str = column("forces_missing", "why they are null", "varchar(100)", cut=True, default="")
+    missing: str = column("forces_missing", "why they are null", "varchar(1000)", cut=True, default="")
 
 
 @record
@@ -88,7 +88,7 @@ class TrialKinetics:
     name: str
     status: str = column("trial_forces_status", type="enum('PASS', 'EMPTY')")
     code: str = column("trial_forces_code", "why EMPTY", "varchar(32)")
-    reason: str = column("trial_forces_reason", "the code in words", "varchar(255)", cut=True)
+    reason: str = column("trial_forces_reason", "the code in words", "varchar(1000)", cut=True)
     cycles: tuple[CycleKinetics, ...] = ()
     series: Series | None = dataclasses.field(default=None, compare=False, repr=False)
     samples: np.ndarray | None = dataclasses.field(default=None, compare=False, repr=False)
@@ -100,7 +100,7 @@ class Kinetics:
 
     status: str = column("forces_status", type="enum('PASS', 'EMPTY')")
     code: str = column("forces_code", "why EMPTY, such as AID or VERTICAL_UNKNOWN", "varchar(32)")
-    reason: str = column("forces_reason", "the code in words", "varchar(255)", cut=True)
+    reason: str = column("forces_reason", "the code in words", "varchar(1000)", cut=True)
     measures: Mapping[str, KineticMeasure]
     reasons: Mapping[str, str]  # of each missing measure
     #: All numbers are per body weight or per kilogram and do not need it.

@@ -57,7 +57,7 @@ class KeypointFigures:
         "median_confidence", "(0..1) median over the points that were seen, null when none was", null=True
     )
     camera_kind: str = column("camera_kind", "where the intrinsics come from", _KIND_TYPE)
-    camera_source: str = column("camera_source", "the same in words", "varchar(255)", cut=True)
+    camera_source: str = column("camera_source", "the same in words", "varchar(1000)", cut=True)
     focal_px: float = column("focal_length", "(px) mean of fx and fy")
     focal_rel_sd: float = column(
         "focal_rel_sd", "(1) standard deviation of the focal length as a share of it, null when unknown", null=True
@@ -76,7 +76,7 @@ class HiddenHeads:
         "REVIEW: some frames are to be looked at; NO_HEAD: nothing was covered",
         "enum('CERTAIN', 'REVIEW', 'NO_HEAD')",
     )
-    reason: str = column("{}_reason", "the status in words", "varchar(255)", cut=True)
+    reason: str = column("{}_reason", "the status in words", "varchar(1000)", cut=True)
     n_heads: int = column("{}_heads", "heads that were found, false ones included", "int32")
     n_uncertain: int = column("{}_uncertain", "frames that are not certain", "int32")
     ranges: tuple[dict, ...] = column("{}_ranges", "runs of these: first and last frame (from 0), and why", "json")

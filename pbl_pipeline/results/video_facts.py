@@ -30,10 +30,10 @@ class FirstPicture:
     width_px: int = column("width", "(px) of the upright frame", "int32", before="fps")
     height_px: int = column("height", "(px) of the upright frame", "int32", before="fps")
     rotation_deg: int = column("rotation", "(deg) rotation flag of the file", "int16", before="fps")
-    make: str | None = column("phone_make", type="varchar(64)", cut=True, before="capture_fps")
-    model: str | None = column("phone_model", type="varchar(64)", cut=True, before="capture_fps")
+    make: str | None = column("phone_make", type="varchar(64)", cut="tag", before="capture_fps")
+    model: str | None = column("phone_model", type="varchar(64)", cut="tag", before="capture_fps")
     lens: str | None = column(
-        "phone_lens", "lens as the phone names it", "varchar(128)", cut=True, before="capture_fps", default=None
+        "phone_lens", "lens as the phone names it", "varchar(128)", cut="tag", before="capture_fps", default=None
     )
     focal_35mm: float | None = column(
         "focal_35mm",
@@ -71,16 +71,16 @@ class VideoInfo(FirstPicture):
 
     sha256: str = column("video_sha256", "of its bytes: the same file is never registered twice", "char(64)")
     size_bytes: int = column("video_size", "(byte) length of the file", "int64")
-    container: str = column("container", type="varchar(64)", cut=True)
-    codec: str = column("codec", type="varchar(32)", cut=True)
-    pixel_format: str = column("pixel_format", type="varchar(32)", cut=True)
+    container: str = column("container", type="varchar(64)", cut="tag")
+    codec: str = column("codec", type="varchar(32)", cut="tag")
+    pixel_format: str = column("pixel_format", type="varchar(32)", cut="tag")
     time_s: np.ndarray
     fps: float = column("fps", "(1/s) 1 / sampling interval, a description only", null=True)
     duration_s: float = column("duration", "(s) from the first frame to the end of the last", null=True)
     n_frames: int = column("n_frames", "frames that decode", "int32")
     n_frames_announced: int = column("n_frames_announced", "frames the header claims, 0 when it says nothing", "int32")
     variable_frame_rate: bool = column("variable_frame_rate", "whether frame intervals differ", "bool")
-    recorded_utc: str | None = column("recorded_utc", "recording time as the file states it", "varchar(40)", cut=True)
+    recorded_utc: str | None = column("recorded_utc", "recording time as the file states it", "varchar(40)", cut="tag")
     notes: tuple[str, ...] = column(
         "video_notes", "remarks on the file, such as a mirrored picture", "json", before="(end)", default=()
     )

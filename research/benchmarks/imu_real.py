@@ -45,7 +45,7 @@ def foot(folder: Path, side: str) -> tuple[float, float]:
     imu = pd.read_csv(folder / "imu_sample.csv.gz", header=[0, 1], index_col=0)[f"{side}_sensor"]
     markers = pd.read_csv(folder / "mocap_sample.csv.gz", header=[0, 1], index_col=0)
     places = np.stack(
-        [markers[f"{side[0].upper()}_{m}"][list("xyz")].to_numpy() for m in ("TOE", "FCC", "FM5")], axis=1
+        [np.asarray(markers[f"{side[0].upper()}_{m}"][list("xyz")]) for m in ("TOE", "FCC", "FM5")], axis=1
     )
     known = np.flatnonzero(np.isfinite(places).all(axis=(1, 2)))
     run = max(np.split(known, np.flatnonzero(np.diff(known) > 1) + 1), key=len)
@@ -61,7 +61,8 @@ def foot(folder: Path, side: str) -> tuple[float, float]:
         own.to_csv(path := Path(written) / f"{side}.csv", index=False)
         (log,) = read_given([Given(path, f"foot_{side[0]}")])
     sensor, best = oriented(log), (np.inf, 0.0)
-    low = lambda x: filtfilt(*butter(4, 10 / 50), x, axis=0)  # noqa: E731
+    over, under = np.asarray(butter(4, 10 / 50))
+    low = lambda x: filtfilt(over, under, x, axis=0)  # noqa: E731
     for lag in np.arange(-0.15, 0.151, 0.005):
         quat, known = sensor.at(even + lag)
         theirs = low(rate_of(quat))

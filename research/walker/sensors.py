@@ -64,7 +64,7 @@ def worn(
         noise = _memory(rng, len(time), rate_hz) * np.deg2rad(wobble * WOBBLE_DEG[kind])
         axis = rng.normal(size=3)
         most = mounting_deg if isinstance(mounting_deg, float | int) else mounting_deg.get(segment, 180.0)
-        mount = Rotation.random(random_state=int(rng.integers(2**31)))
+        mount = Rotation.from_quat(np.random.RandomState(int(rng.integers(2**31))).normal(size=4))
         if most < 180:
             mount = Rotation.from_rotvec(np.deg2rad(most) * axis / np.linalg.norm(axis))
         bias, white = np.deg2rad(rng.normal(0, bias_deg_s, 3)), rng.normal(size=(2, len(time), 3))

@@ -17,6 +17,7 @@ register(
         "DB_NOT_FOUND": Code(CALL, "a row that was named does not exist"),
         "DB_MIGRATION": Code(MACHINE, "the tables on the server are not as this version of the code declares them"),
         "INPUT_CHANGED": Code(MACHINE, "rows that a computation reads are gone, or changed each time it ran"),
+        "NOT_QUEUED": Code(MACHINE, "it is stored, but what is to be computed then could not be queued yet"),
         "STORE_UNAVAILABLE": Code(MACHINE, "the object store of the arrays cannot be reached, or refuses"),
         "STORE_FULL": Code(MACHINE, "the store of the arrays has no room left"),
         "BACKUP_INVALID": Code(INPUT, "a backup is incomplete or was changed"),

@@ -11,6 +11,7 @@ from typing import Any
 import pymysql
 
 from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said, said_of
+from pbl_pipeline.names import shortened
 
 from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, LONGER, REPEAT, TOO_LONG, LostConnectionError
 
@@ -26,13 +27,8 @@ _REPORT = "report this with the error stack that `pbl status --json` prints"
 def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
     """Return the same error, cut to fit the job's error row, with the job's key where it has none."""
     about = error.key if error.key is not None else ", ".join(f"{k}={v}" for k, v in key.items())
-    return PblError(
-        error.code,
-        found=_cut(error.found, _LIMITS["found"]),
-        expected=_cut(error.expected, _LIMITS["expected"]),
-        next_step=_cut(error.next_step, _LIMITS["next_step"]),
-        key=_cut(str(about), _LIMITS["key"]),
-    )
+    whole = {"found": error.found, "expected": error.expected, "next_step": error.next_step, "key": str(about)}
+    return PblError(error.code, **{part: shortened(text, _LIMITS[part]) for part, text in whole.items()})
 
 
 def store_full(error: BaseException) -> PblError | None:
@@ -41,7 +37,7 @@ def store_full(error: BaseException) -> PblError | None:
         if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
             return PblError(
                 "STORE_FULL",
-                found=_cut(f"{type(seen).__name__}: {seen}", _LIMITS["found"]),
+                found=shortened(f"{type(seen).__name__}: {seen}", _LIMITS["found"]),
                 expected="room for arrays and temporary files",
                 next_step="free space, or give the store's disk or bucket more; jobs that met it go on by themselves",
             )
@@ -89,17 +85,9 @@ def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblErr
     if (full := store_full(error)) is not None:
         return fitted(full, key)
     about = f"{table} " + ", ".join(f"{k}={v}" for k, v in key.items())
-    return PblError(
-        "INTERNAL",
-        found=_cut(f"{type(error).__name__}: {error}", _LIMITS["found"]),
-        expected="a result or a coded error",
-        next_step=_REPORT,
-        key=_cut(about, _LIMITS["key"]),
+    return fitted(
+        PblError("INTERNAL", f"{type(error).__name__}: {error}", "a result or a coded error", _REPORT, about), key
     )
-
-
-def _cut(text: str, limit: int) -> str:
-    return text if len(text) <= limit else text[: limit - 4] + " ..."
 
 
 def of_job(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
@@ -120,7 +108,7 @@ def as_text(error: PblError, longest: int) -> str:
         if isinstance(data[part], dict):
             data[part] = str(said_of(data[part]))
         else:
-            data[part] = _cut(data[part], int(0.9 * len(data[part])))
+            data[part] = shortened(data[part], int(0.9 * len(data[part])))
     return text
 
 

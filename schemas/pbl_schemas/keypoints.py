@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.names import shortened
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, from_row, to_row
 from pbl_pipeline.results.people import KeypointFigures
@@ -57,7 +58,7 @@ class Keypoints(dj.Computed):
     keypoints_person_id   : int16              # number of the measured person in the tracking
     {definition(KeypointFigures)}
     keypoints_camera_id=null : int32           # calibration that was used (lab.CameraCalibration), null where none was there
-    phone_log=null        : varchar(255)       # the phone's sensor log and how its clock was brought to the video's, null without
+    phone_log=null        : varchar(1000)      # the phone's sensor log and how its clock was brought to the video's, null without
     keypoints_file        : <object@arrays>   # keypoints.npz: time_s (T) s, xy_px (T,J,2) px, xyz_cam_m (T,J,3) m, confidence (T,J) 0..1, box_px (T,4) px, camera; docs/files.md
     index (camera_kind)
     {origin_columns("keypoints")}
@@ -129,7 +130,7 @@ class Keypoints(dj.Computed):
                     "keypoints_person_id": person,
                     **to_row(found.figures),
                     "keypoints_camera_id": camera_id,
-                    "phone_log": None if log is None else log[:255],
+                    "phone_log": None if log is None else shortened(log, 1000),
                     "keypoints_file": folder / "keypoints.npz",
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from pbl_pipeline.names import shortened
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import from_row
 
@@ -91,6 +92,6 @@ class SessionQc(dj.Computed):
     def make_insert(
         self, key: dict, outcome: str, named: Sequence[str], rows: Sequence[dict[str, Any]], origin: Origin
     ) -> None:
-        row = {"qc_outcome": outcome, "qc_n": len(rows), "qc_worst": ", ".join(dict.fromkeys(named))[:1000]}
+        row = {"qc_outcome": outcome, "qc_n": len(rows), "qc_worst": shortened(", ".join(dict.fromkeys(named)), 1000)}
         self.insert1({**fit.of_session(key), **row, **origin.row("qc")})
         self.Check.insert({**key, "qc_no": i, **row} for i, row in enumerate(rows, 1))

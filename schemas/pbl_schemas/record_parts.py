@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from pbl_pipeline.names import shortened
 from pbl_pipeline.records import declared, definition, from_row, to_row
 from pbl_pipeline.results.measures import OF_VISIT
 
@@ -50,7 +51,7 @@ class Measures:
             {
                 **key,
                 cls.by: name,
-                f"{cls.prefix}_missing": reasons.get(name, "")[:255],
+                f"{cls.prefix}_missing": shortened(reasons.get(name, ""), 1000),
                 **to_row(measure or cls.record, cls.prefix, cls.without),
             }
             for name, measure in measures.items()
@@ -112,7 +113,7 @@ def measures_of(record: type, prefix: str, comment: str, by: str, of_visit: bool
     {by}  # name, with its unit
     ---
     {definition(record, prefix, OF_VISIT)}
-    {prefix}_missing : varchar(255)  # why it is null
+    {prefix}_missing : varchar(1000)  # why it is null
     {definition(record, prefix, only=OF_VISIT) if of_visit else ""}
     """
     own = {"record": record, "prefix": prefix, "by": by.split()[0], "without": () if of_visit else OF_VISIT}

@@ -11,6 +11,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import pymysql
 
+from pbl_pipeline.errors import PblError, said
+
 from . import lab
 from .datajoint_setup import REPEAT, DuplicateError, dj
 
@@ -31,8 +33,21 @@ def _inside() -> bool:
 
 
 def after_commit(call: Callable[[], object]) -> None:
-    """Call once the open transaction, of a `repeated` function, is committed; immediately if none is open."""
-    _waiting.append(call) if _inside() else call()
+    """Call once the open transaction, of a `repeated` function, is committed; immediately if none is open. Where it
+    fails that function raises `PblError` NOT_QUEUED: what it wrote stays."""
+    _waiting.append(call) if _inside() else _follow(call)
+
+
+def _follow(call: Callable[[], object]) -> None:
+    try:
+        call()
+    except Exception as error:
+        raise PblError(
+            "NOT_QUEUED",
+            found=said("it is stored, but what follows from it is not queued yet ({why})", why=str(error)),
+            expected="jobs for what is to be computed",
+            next_step="do not send it again: workers look for it by themselves, within an hour at the latest",
+        ) from error
 
 
 def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
@@ -54,7 +69,7 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
             if not _inside():
                 calls, _waiting[:] = _waiting.copy(), []  # a call may be a transaction itself
                 for call in calls:
-                    call()
+                    _follow(call)
             return done
         raise AssertionError("unreachable")
 

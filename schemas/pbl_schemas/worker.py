@@ -13,6 +13,9 @@ schema = dj.Schema()
 #: `worker_resource` of rows of regular work, one for each kind of `pbl cron`: worker_seen is its last sign of life,
 #: worker_stopped when it last succeeded, worker_doing how the last pass failed ("": it did not).
 CRON = "cron"
+#: `worker_resource` of a worker's supervisor, which takes no job: worker_doing names its processes that wait after they
+#: died.
+SUPERVISOR = "supervisor"
 
 
 @schema
@@ -29,6 +32,7 @@ class Worker(dj.Manual):
     worker_seen     : datetime(3)              # last heartbeat, clock of the database server
     worker_stopped=null : datetime(3)          # when it ended in order
     worker_doing    : varchar(500)             # table and key in hand, or why it waits
+    worker_gpus=null : json                    # of a supervisor: use of the GPUs of its machine; null: not known
     """
 
 

@@ -161,3 +161,31 @@ def undo_0013(cursor: Any) -> None:
 def undo_0014(cursor: Any) -> None:
     """Forget which depth recordings are read, and their scale."""
     cursor.execute("ALTER TABLE pbl_video.depth_video DROP COLUMN depth_read, DROP COLUMN depth_scale")
+
+
+def undo_0015(cursor: Any) -> None:
+    """Forget the use of GPUs."""
+    cursor.execute("ALTER TABLE pbl_worker.worker DROP COLUMN worker_gpus")
+
+
+def undo_0016(cursor: Any) -> None:
+    """Narrow the columns of reasons."""
+    before = {"cycle_lengths_missing": 150, "curves_missing": 100, "forces_missing": 100}
+    for table, names in {
+        "pbl_keypoints.__keypoints": ("camera_source", "phone_log"),
+        "pbl_gait.__gait_cycle__cycle": ("cycle_lengths_missing", "curves_missing"),
+        "pbl_gait.__spatiotemporal__measure": ("measure_missing",),
+        "pbl_gdi.__session_gdi__measure": ("session_measure_missing",),
+        "pbl_kinetics.__kinetics": ("forces_reason",),
+        "pbl_kinetics.__kinetics__trial": ("trial_forces_reason",),
+        "pbl_kinetics.__kinetics__cycle": ("forces_missing",),
+        "pbl_kinetics.__kinetics__measure": ("force_missing",),
+        "pbl_privacy.__deidentified": ("deidentified_reason",),
+    }.items():
+        for name in names:
+            cursor.execute(f"SHOW FULL COLUMNS FROM {table} LIKE '{name}'")
+            _, _, _, nullable, _, default, _, _, comment = cursor.fetchone()
+            longest = before.get(name, 255)
+            null = "NULL" if nullable == "YES" else "NOT NULL" if default is None else "NOT NULL DEFAULT ''"
+            said = comment.replace("varchar(1000)", f"varchar({longest})")
+            cursor.execute(f"ALTER TABLE {table} MODIFY COLUMN {name} VARCHAR({longest}) {null} COMMENT %s", (said,))

@@ -2,6 +2,8 @@
 
 import json
 import operator
+import os
+import platform
 import re
 import shutil
 import subprocess
@@ -19,8 +21,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from pbl_pipeline import settings
 from pbl_schemas import connection, video, worker
 from pbl_workers import heartbeat, metrics
-from tests import Environment, Limits, Machine
-from tests.command import pbl
+from tests import Environment, Limits, Machine, until
+from tests.command import pbl, program
 
 from .jobs import beat, queued
 
@@ -191,6 +193,33 @@ def test_workers_count_regular_work_not_as_workers(healthy: Path):
     shown = pbl("status").out
     assert "worker alive:1" in shown
     assert shown.count("\nworker ") == 1
+
+
+def test_gpus_and_resting_processes_are_shown_of_live_workers(
+    healthy: Path, tmp_path: Path, environment: Environment, limits: Limits
+):
+    shown = pbl("status").out
+    assert "\nGPUs of alive: unknown\n" in shown
+    limits(heartbeat, PERIOD_S=0.05)
+    program(tmp_path, "nvidia-smi", "echo '0, 37, 1000, 2000'; echo '1, [N/A], 0, 2000'")
+    environment(PATH=f"{tmp_path}:{os.environ['PATH']}")
+    with heartbeat.Heartbeat(worker.SUPERVISOR) as beats:
+        beats.doing("process 2 (GPU 1) starts again 8 s after it died")
+        until(lambda: "starts again" in pbl("status").out)
+        for command in (("status",), ("cron", "summary")):
+            shown = " ".join(pbl(*command).out.replace(": ", " ").split())
+            assert f"worker {platform.node()} process 2 (GPU 1) starts again 8 s after it died" in shown
+            assert f"GPU 0 of {platform.node()} 37% busy, 1.0 of 2.1 GB used" in shown
+            assert f"GPU 1 of {platform.node()} 0.0 of 2.1 GB used" in shown
+        found = {m["host"]: m["gpus"] for m in json.loads(pbl("status", "--json").out)["machines"]}
+        assert found["alive"] is None
+        assert found[platform.node()][1] == {"gpu": "1", "used": 0.0, "size": 2000 * 2**20}
+        assert [s.value for s in samples() if s.name == "pbl_workers"] == [1.0]  # a supervisor takes no job
+        program(tmp_path, "nvidia-smi", "exit 9")
+        until(lambda: f"GPUs of {platform.node()}: unknown" in pbl("status").out)
+        environment(PATH=os.environ["PATH"].partition(":")[2])
+        until(lambda: f" of {platform.node()}" not in pbl("status").out)
+    assert platform.node() not in pbl("status").out
 
 
 def test_figures_of_the_installation_sum_up_over_workers(healthy: Path, tmp_path: Path, limits: Limits):

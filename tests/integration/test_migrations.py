@@ -32,6 +32,7 @@ from pbl_schemas import (
     tables_version,
     validation,
     video,
+    worker,
 )
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.decisions import event_corrections, review_decisions
@@ -178,6 +179,8 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0016,
+        older_tables.undo_0015,
         older_tables.undo_0014,
         older_tables.undo_0013,
         older_tables.undo_0012,
@@ -387,6 +390,8 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert {"imu_segments", "imu_rate"} < set(video.WearableImu.heading.names)
     assert {"depth_read", "depth_scale"} < set(video.DepthVideo.heading.names)
+    assert "worker_gpus" in worker.Worker.heading.names
+    assert "varchar(1000)" in gait.Spatiotemporal.Measure.heading["measure_missing"].original_type
     assert migrations.migrate().steps == []
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import pymysql
 import pytest
 
 from pbl_pipeline.errors import PblError
@@ -19,8 +20,9 @@ from pbl_schemas.reading.why import why
 from pbl_schemas.review import Decision
 from pbl_schemas.studies import slices
 from pbl_schemas.transactions import after_commit, in_transaction
+from pbl_workers import refresh
 from pbl_workers.populate import populate
-from tests import StandIn
+from tests import Faults, Limits, StandIn
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
 from tests.integration.chain import computed_once, small_video
@@ -57,6 +59,33 @@ def current() -> list[list[int]]:
     """Recordings of the current sets."""
     rows = (fit.FitSet.Video.proj() * fit.current()).to_dicts(order_by="fit_set, video_id")
     return [[r["video_id"] for r in rows if r["fit_set"] == s] for s in dict.fromkeys(r["fit_set"] for r in rows)]
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_where_only_the_queue_fails_the_page_says_what_is_written(
+    visit: tuple[int, int], faults: Faults, limits: Limits, by_hand: bool
+):
+    """The decision is committed; the next look at all tables or at recent decisions queues what it asks for."""
+    browser = web.client(name="A. First")
+    full = pymysql.err.OperationalError(1114, "The table '~~session_fit' is full")
+    with faults(refresh, "refresh_scope", full):
+        answer = send(browser, 2, usable="no", reason="interrupted", note="stumbled")
+    assert answer.status_code == 503
+    assert "NOT_QUEUED" in answer.text
+    assert "it is stored, but what follows from it is not queued yet (" in answer.text
+    assert "Do not send it again" in answer.text
+    assert "nothing was" not in answer.text.lower()
+    assert (len(video.NotUsable()), len(Decision())) == (1, 1)
+    assert "not usable" in browser.get("/visits/1").text
+    assert len(jobs_of(fit.SessionFit)) == 0
+    if by_hand:
+        assert pbl("cron", "refresh").code == 0
+    else:  # as a worker of a large installation looks each minute
+        limits(refresh, FEW=1)
+        assert refresh.refresh(False) is not None
+    assert len(jobs_of(fit.SessionFit).pending) == 1
+    populate()
+    assert current() == [[1]]
 
 
 def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, int]):

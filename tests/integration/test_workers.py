@@ -30,7 +30,7 @@ from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.cli.why import why as why_command
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import embedded
-from pbl_schemas.reading.status import live_workers, pipeline_status
+from pbl_schemas.reading.status import live_workers, machines, pipeline_status
 from pbl_schemas.reading.why import why
 from pbl_schemas.rows import utc_now
 from pbl_workers import heartbeat, loop, queue, recover, refresh, registry, requeue, run_job, supervisor
@@ -405,6 +405,20 @@ def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(t
     assert len(fit.SessionFit.Trial()) == 2
 
 
+def test_one_gpu_that_fails_is_said_and_the_work_goes_on(tables, tmp_path: Path, quick: None, limits: Limits):
+    register(*videos(tmp_path, "walk1", "walk2"))
+    limits(heartbeat, PERIOD_S=0.2)
+    limits(supervisor, RESTART_S=(0.5, 2.0))
+    boss = Supervisor(Options("decode", 2, selftest=False, gpus=("free", "full")), target=worker_target.work)
+
+    def seen() -> bool:
+        told = [text for machine in machines() for text in machine.resting]
+        return len(video.VideoInfo()) == 2 and any("GPU full" in t and "times in a row" in t for t in told)
+
+    assert run_until(boss, functools.partial(until, seen)) == 0
+    assert "VideoInfo" not in jobs_left()
+
+
 def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None):
     ids = register(*videos(tmp_path, "walk1", "hangs", "walk2"))
     factor = 4.0 / registry.stage_of("VideoInfo").limit_s
@@ -474,7 +488,8 @@ def test_the_process_for_phones_ends_with_the_others(tables: None, tmp_path: Pat
     register(*videos(tmp_path, "walk"))
     assert Supervisor(Options("decode", max_jobs=1, selftest=False, phones=True), target=worker_target.work).run() == 0
     assert len(video.VideoInfo()) == 1
-    assert len(worker.Worker & "worker_stopped IS NOT NULL") >= 1  # it may be told to end before it has its row
+    ended = f"worker_stopped IS NOT NULL AND worker_resource != '{worker.SUPERVISOR}'"
+    assert len(worker.Worker & ended) >= 1  # it may be told to end before it has its row
     assert len(worker.Worker & "worker_stopped IS NULL") == 0
 
 

@@ -2,7 +2,7 @@
 
 A recording's name says what it does to the process that probes it: `kills` ends it at once, `hangs` never returns,
 `slow` ends soon after its process was told to end. Tracking of an `hour` ends when there is a file of its name and
-`.go`.
+`.go`. The GPU `full` has no memory.
 """
 
 import os
@@ -25,6 +25,8 @@ from . import chain
 
 def work(options: Options, pipe: Connection) -> None:
     """`pbl_workers.process.work` with stand-ins."""
+    if options.gpus == ("full",):
+        raise SystemExit(process.DEVICE_FAILED)
     patch = pytest.MonkeyPatch()
     chain.install(patch)
     real = pbl_pipeline.video.probe

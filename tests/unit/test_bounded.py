@@ -292,17 +292,17 @@ def test_a_disk_that_fails_is_no_fault_of_a_file(tmp_path: Path):
     """Nothing at the first address: reading it is an error of input and output (EIO)."""
     for name in ("a.json", "a.zip", "k.npz", "a.trc", "a.csv", "a.xml"):
         (tmp_path / name).symlink_to("/proc/self/mem")
-    for read, name in (
-        *((read, "a.json") for _, read in every_json_reader(tmp_path / "a.json")),
+    readers: list[tuple[Callable[[Path], object], str]] = [
+        *((lambda _, read=read: read(), "a.json") for _, read in every_json_reader(tmp_path / "a.json")),
         *((read_phone_log, name) for name in ("a.zip", "a.csv")),
         (Keypoints.load, "k.npz"),
         (load_events, "a.csv"),
         (load_marker_set, "a.xml"),
         (read_trc, "a.trc"),
-    ):
-        arguments = () if name == "a.json" else (tmp_path / name,)
+    ]
+    for read, name in readers:
         with pytest.raises(PblError) as caught:
-            read(*arguments)
+            read(tmp_path / name)
         assert (caught.value.code, caught.value.final) == ("FILE_MISSING", False), name
 
 
@@ -311,17 +311,15 @@ def test_a_disk_that_fails_within_an_archive_is_no_fault_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):
     path = zeros(tmp_path / "log.zip", "Orientation.csv", 2)
-    read, n_read = io.BufferedReader.read, 0
-
-    def fails(file: io.BufferedReader, *n: int) -> bytes:
-        nonlocal n_read
-        n_read += 1
-        if n_read > (3 if kind == "archive" else 0):
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        return read(file, *n)
+    n_read = 0
 
     class Failing(io.BufferedReader):
-        read = fails
+        def read(self, size: int | None = -1, /) -> bytes:
+            nonlocal n_read
+            n_read += 1
+            if n_read > (3 if kind == "archive" else 0):
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return super().read(size)
 
     monkeypatch.setattr(bounded, "open", lambda p, *_, **__: Failing(io.FileIO(p)), raising=False)
     with pytest.raises(PblError) as caught:

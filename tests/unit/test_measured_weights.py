@@ -8,6 +8,7 @@ import pytest
 from pbl_pipeline.body import load_body, marker_positions
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.fit.measured_weights import MOST, with_measured_weights
+from pbl_pipeline.fit.params import GaussNewtonParams, Params
 from pbl_pipeline.fit.per_frame import start_of
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.weights import Weights
@@ -15,7 +16,9 @@ from research.walker.observe import observe
 from research.walker.walk import walk_qpos
 
 TIME_S = np.arange(40) / 30
-PARAMS = METHODS["blazepose-measured"].params
+_OF_METHOD = METHODS["blazepose-measured"].params
+assert isinstance(_OF_METHOD, GaussNewtonParams)
+PARAMS = _OF_METHOD
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +27,7 @@ def session():
     return make_session([seen.keypoints], ["walk"], PARAMS)
 
 
-def weighed(session, params=PARAMS, **points):
+def weighed(session, params: Params = PARAMS, **points):
     """Factors of `c_2d` and `c_3d` of each marker, where points are moved by `points` off the fitted ones."""
     p, start = session.problem, start_of(session)
     body, table = load_body(), p.points

@@ -13,6 +13,7 @@ import pytest
 
 from pbl_pipeline import results
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import shortened
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import column, declared, definition, from_json, from_row, plain, record, stored, to_row
 from pbl_pipeline.results.cycles import GaitCycle
@@ -22,6 +23,7 @@ from pbl_pipeline.results.index import NormFacts, VariableScore
 from pbl_pipeline.results.measures import Measure
 from pbl_pipeline.results.people import HiddenHeads, KeypointFigures, TrackFigures
 from pbl_pipeline.results.video_facts import Intrinsics
+from pbl_schemas import gait
 
 
 @record
@@ -79,7 +81,7 @@ def test_a_record_is_read_as_it_was_written():
 @pytest.mark.parametrize("unknown", [None, math.nan, math.inf])
 def test_what_is_not_known_is_null(unknown: float | None):
     row = to_row(Whole(0, math.nan, (), np.ones(2), Part(unknown, "too long a reason")), "x")
-    assert [row[k] for k in ("x_mean", "x_side", "x_size", "x_why")] == [None, None, None, "too l"]
+    assert [row[k] for k in ("x_mean", "x_side", "x_size", "x_why")] == [None, None, None, "t ..."]
     again = from_row(Whole, row, "x", curve=np.ones(2))
     assert math.isnan(again.mean)
     assert (again.side, again.part.size_m) == ("", None)
@@ -91,6 +93,36 @@ def test_a_name_that_is_longer_than_its_column_is_refused():
     with pytest.raises(PblError, match=r"^USAGE: (?s:.*)angle of 33 characters(?s:.*)0 to 32 characters"):
         to_row(profile, "x")
     assert to_row(dataclasses.replace(profile, angle="a" * 32), "x")["x_angle"] == "a" * 32
+
+
+@pytest.mark.parametrize(
+    ("text", "longest", "expected"),
+    [
+        ("one two three", 13, "one two three"),
+        ("one two three", 12, "one two ..."),
+        ("one two three", 11, "one two ..."),
+        ("one two three", 10, "one ..."),
+        ("a" * 20, 10, "aaaaaa ..."),  # without a word that ends
+        ("a " + "b" * 20, 10, "a bbbb ..."),
+        ("one two", 3, " .."),
+    ],
+)
+def test_a_text_that_is_too_long_ends_after_a_word_and_says_so(text: str, longest: int, expected: str):
+    assert shortened(text, longest) == expected
+
+
+def test_reasons_are_written_whole(monkeypatch: pytest.MonkeyPatch):
+    """One of 700 characters was cut at 255, unsaid."""
+    written: list[dict[str, Any]] = []
+    table = gait.Spatiotemporal.Measure
+    monkeypatch.setattr(table, "insert", classmethod(lambda _, rows: written.extend(rows)))
+    reason = "the feet are hidden behind the walking frame in 40 of 60 frames; " * 11
+    table.insert_measures({}, {"cadence": None, "speed": None}, {"cadence": reason, "speed": reason * 2})
+    assert written[0]["measure_missing"] == reason
+    assert len(written[1]["measure_missing"]) <= 1000
+    assert written[1]["measure_missing"].endswith(" ...")
+    kept = written[1]["measure_missing"].removesuffix(" ...")
+    assert (reason * 2).startswith(kept + " ")
 
 
 def test_an_unknown_record_is_null_and_counts_nothing():

@@ -11,6 +11,7 @@ import urllib.request
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import jax
@@ -23,15 +24,17 @@ from pbl_pipeline.models.gpu_address import gpu_number
 from pbl_pipeline.resources import VISIBLE_GPUS, given_gpus
 from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
-from pbl_workers import metrics, process, recover, registry, run_job, selftest
+from pbl_workers import log, metrics, process, recover, registry, run_job, selftest, supervisor
 from pbl_workers.metrics import Metrics
 from pbl_workers.process import Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
-from pbl_workers.supervisor import Supervisor, _Child
-from tests import Environment, Limits, Machine, refused
+from pbl_workers.supervisor import HOPELESS, Supervisor, _Child
+from tests import Environment, Limits, Machine, refused, until
 from tests.command import program
 from tests.ended_process import Ended
+
+from . import gpu_by_name
 
 
 class Process:
@@ -61,13 +64,13 @@ class Process:
 
 
 @pytest.fixture
-def boss(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def boss(monkeypatch: pytest.MonkeyPatch, limits: Limits) -> SimpleNamespace:
     """A supervisor of one process whose jobs no database knows, and what was left of each that died."""
     found = Supervisor(Options(), Metrics())
     left: list[int] = []
     monkeypatch.setattr(found, "_settle_jobs", lambda child, *_: left.append(len(child.jobs)))
     monkeypatch.setattr(found, "_launch", lambda _: Process().child)
-    monkeypatch.setattr("pbl_workers.supervisor.time.sleep", lambda _: None)
+    limits(supervisor, RESTART_S=(0.0, 0.0))
     process = Process()
     found._children = [process.child]
     return SimpleNamespace(supervisor=found, process=process, left=left)
@@ -258,7 +261,8 @@ def test_one_gpu_needs_no_turn_nor_what_windows_lacks(environment: Environment, 
 
 
 @pytest.mark.parametrize(
-    ("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), ("exec /bin/sleep 60", ()), (None, ())]
+    ("answer", "expected"),
+    [('echo "0, [N/A]"\necho 1', ("0", "1")), ("exit 9", ()), ("exec /bin/sleep 60", ()), (None, ())],
 )
 def test_otherwise_the_driver_lists_them(
     answer: str | None, expected: tuple, tmp_path: Path, environment, limits: Limits
@@ -268,6 +272,7 @@ def test_otherwise_the_driver_lists_them(
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected
+    assert resources.gpu_use() == ([{"gpu": g} for g in expected] if expected else [] if answer is None else None)
 
 
 def test_use_and_memory_of_gpus_are_among_the_figures(tmp_path: Path, environment: Environment):
@@ -347,7 +352,7 @@ def test_where_the_device_fails_the_process_ends_and_the_job_is_left_to_another(
     assert not run_job.device_failure(other)  # the next device would meet it too: an error row
 
 
-def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):
+def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch, limits: Limits):
     started: list[Options] = []
 
     class Process(Ended):
@@ -359,6 +364,64 @@ def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: p
 
     boss = Supervisor(Options(processes=2, gpus=("4", "7"), once=True))
     monkeypatch.setattr(boss, "_start", SimpleNamespace(Process=Process, Pipe=Pipe))
-    monkeypatch.setattr("pbl_workers.supervisor.time.sleep", lambda _: None)
+    limits(supervisor, RESTART_S=(0.0, 0.0))
     assert boss.run() == 0
     assert [options.gpus for options in started] == [("4",), ("7",), ("7",)]
+
+
+def starts(folder: Path, gpu: str) -> int:
+    return len((folder / gpu).read_text(encoding="utf-8").splitlines())
+
+
+def of_gpus(folder: Path, *gpus: str, **options: Any) -> Supervisor:
+    """A worker with a process for each GPU, which it ends as `gpu_by_name` says."""
+    given = Options("gpu", len(gpus), gpus=gpus, selftest=False, profile=str(folder), **options)
+    boss = Supervisor(given, target=gpu_by_name.work)
+    once: Any = multiprocessing.get_context("forkserver")  # imports once what all need
+    once.set_forkserver_preload([gpu_by_name.__name__])
+    boss._start = once
+    return boss
+
+
+def test_one_full_gpu_stops_no_other_process(tmp_path: Path, limits: Limits):
+    limits(supervisor, RESTART_S=(0.05, 0.2))
+    boss = of_gpus(tmp_path, "free", "full", "also free")
+    told: list[str] = []
+
+    def look() -> None:
+        try:
+            until(lambda: (tmp_path / "full").exists() and starts(tmp_path, "full") > HOPELESS, 60)
+            told.append(str(boss._places[1]))
+        finally:
+            boss.stop()
+
+    beside = threading.Thread(target=look)
+    beside.start()
+    assert boss.run() == 0
+    beside.join()
+    assert starts(tmp_path, "free") == starts(tmp_path, "also free") == 1
+    (text,) = told
+    assert text.startswith("process 2 (GPU full) starts again 0.2 s after it died: its GPU does not compute")
+
+
+def test_a_worker_ends_where_no_process_can_run(tmp_path: Path, limits: Limits, caplog: pytest.LogCaptureFixture):
+    limits(supervisor, RESTART_S=(0.02, 0.05))
+    assert of_gpus(tmp_path, "full", "wrong").run() == process.SELFTEST_FAILED
+    assert (starts(tmp_path, "full"), starts(tmp_path, "wrong")) == (HOPELESS, 1)
+    (end,) = [record for record in caplog.records if record.message == "giving up"]
+    assert "process 2 (GPU wrong) is not started again: its self-test failed" in log.JsonLines().format(end)
+
+
+def test_a_full_gpu_does_not_keep_a_worker_whose_other_processes_have_ended(tmp_path: Path, limits: Limits):
+    limits(supervisor, RESTART_S=(0.02, 0.05))
+    assert of_gpus(tmp_path, "full", "idle", once=True).run() == 1
+    assert starts(tmp_path, "idle") == 1
+
+
+def test_pauses_of_a_place_grow_until_a_process_was_healthy(limits: Limits):
+    limits(supervisor, RESTART_S=(1.0, 3.0))
+    place, pauses = supervisor._Place("process 1"), []
+    for healthy, over_job in ((False, False), (False, True), (False, False), (True, False), (False, False)):
+        place.rest("exit code 1", healthy, over_job)
+        pauses.append((place.pause_s, place.deaths))
+    assert pauses == [(1.0, 1), (2.0, 0), (3.0, 1), (1.0, 0), (2.0, 1)]

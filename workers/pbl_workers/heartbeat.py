@@ -7,6 +7,7 @@ which free the reservations of dead ones (`recover`), and to `pbl status`.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import platform
 import secrets
@@ -19,6 +20,8 @@ import pymysql
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import shortened
+from pbl_pipeline.resources import gpu_use
 from pbl_schemas import connection, worker
 from pbl_schemas.connection import dj
 
@@ -51,7 +54,6 @@ class Heartbeat(Silent):
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._connection: Any = None
-        self._registered = False
 
     def __enter__(self) -> Heartbeat:
         self._try_to_beat()
@@ -68,7 +70,7 @@ class Heartbeat(Silent):
     def doing(self, what: str) -> None:
         """Report the current job; written with the next beat."""
         with self._lock:
-            self._doing = what[:500]
+            self._doing = shortened(what, 500)
 
     def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
         """Add finished jobs; written with the next beat."""
@@ -89,25 +91,13 @@ class Heartbeat(Silent):
     def _beat(self, last: bool = False) -> None:
         if self._connection is None:
             self._connection = connection.another()
-        run, now = self._connection.query, "CURRENT_TIMESTAMP(3)"
-        table, minutes = worker.Worker.full_table_name, worker.Throughput.full_table_name
+        run, now, minutes = self._connection.query, "CURRENT_TIMESTAMP(3)", worker.Throughput.full_table_name
+        gpus = None if last or self.resource != worker.SUPERVISOR else gpu_use()
         with self._lock:
             doing, counts = self._doing, {k: tuple(v) for k, v in self._counts.items()}
             self._counts.clear()
         try:
-            if not self._registered:
-                columns = "worker, worker_host, worker_pid, worker_resource, worker_version"
-                run(
-                    f"INSERT INTO {table} ({columns}, worker_started, worker_seen, worker_doing)"  # noqa: S608
-                    f" VALUES (%s, %s, %s, %s, %s, {now}, {now}, '')",
-                    args=(self.worker, platform.node(), os.getpid(), self.resource, code_version()),
-                )
-                self._registered = True
-            stopped = f", worker_stopped={now}" if last else ""
-            run(
-                f"UPDATE {table} SET worker_seen={now}, worker_doing=%s{stopped} WHERE worker=%s",  # noqa: S608
-                args=(doing, self.worker),
-            )
+            _write(run, self.worker, os.getpid(), self.resource, doing, last, gpus)
             minute = f"DATE_FORMAT({now}, '%%Y-%%m-%%d %%H:%%i:00')"
             while counts:
                 stage, (done, failed, busy) = next(iter(counts.items()))
@@ -151,16 +141,25 @@ def cron_pass(name: str, busy: int) -> Iterator[None]:
 
 def _note(name: str, failed: str | None) -> None:
     """Note that regular work lives, and how it ended unless `failed` is None."""
-    ended = "" if failed is None else ", worker_doing=VALUES(worker_doing)"
-    with contextlib.suppress(pymysql.err.Error, dj.DataJointError, PblError, OSError):
-        table = worker.Worker.full_table_name  # unknown if the work ended before it knew the tables
-        with contextlib.closing(connection.another()) as server:
-            server.query(
-                f"INSERT INTO {table} (worker, worker_host, worker_pid, worker_resource, worker_version,"  # noqa: S608
-                " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 0, %s, %s,"
-                " CURRENT_TIMESTAMP(3), CURRENT_TIMESTAMP(3), IF(%s, CURRENT_TIMESTAMP(3), NULL), %s)"
-                " ON DUPLICATE KEY UPDATE worker_host=VALUES(worker_host), worker_version=VALUES(worker_version),"
-                " worker_seen=VALUES(worker_seen), worker_stopped=COALESCE(VALUES(worker_stopped), worker_stopped)"
-                f"{ended}",
-                args=(f"cron {name}", platform.node(), worker.CRON, code_version(), failed == "", failed or ""),
-            )
+    away = contextlib.suppress(pymysql.err.Error, dj.DataJointError, PblError, OSError)
+    with away, contextlib.closing(connection.another()) as server:
+        _write(server.query, f"cron {name}", 0, worker.CRON, failed, failed == "")
+
+
+def _write(
+    run: Any, name: str, pid: int, resource: str, doing: str | None, ended: bool, gpus: list[Any] | None = None
+) -> None:
+    """Insert or update a row of `Worker`, seen now. doing: None leaves it. ended: in order, now."""
+    now, new = "CURRENT_TIMESTAMP(3)", "{0}=VALUES({0})".format
+    kept = "{0}=COALESCE(VALUES({0}), {0})".format
+    columns = "worker, worker_host, worker_pid, worker_resource, worker_version"
+    run(
+        f"INSERT INTO {worker.Worker.full_table_name} ({columns}, worker_started, worker_seen, worker_stopped,"  # noqa: S608
+        f" worker_doing, worker_gpus) VALUES (%s, %s, %s, %s, %s, {now}, {now}, IF(%s, {now}, NULL), %s, %s)"
+        f" ON DUPLICATE KEY UPDATE {new('worker_host')}, {new('worker_version')}, {new('worker_seen')},"
+        f" {kept('worker_stopped')}, {new('worker_gpus')}, worker_doing=COALESCE(%s, worker_doing)",
+        args=(
+            *(name, platform.node(), pid, resource, code_version(), ended, doing or ""),
+            *(None if gpus is None else json.dumps(gpus), doing),
+        ),
+    )

@@ -13,7 +13,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, star
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from pbl_pipeline.resources import gpus
+from pbl_pipeline.resources import gpu_use
 from pbl_schemas import worker
 from pbl_schemas.operations.archive import disks
 from pbl_schemas.reading import status
@@ -124,16 +124,15 @@ def machine_figures() -> list[GaugeMetricFamily]:
         for name, free_gb, size_gb in disks():
             free.add_metric([name], 1e9 * free_gb)
             size.add_metric([name], 1e9 * size_gb)
-    columns = {
-        "utilization.gpu": GaugeMetricFamily("pbl_gpu_busy_ratio", "Share of time that a GPU works", labels=["gpu"]),
-        "memory.used": GaugeMetricFamily("pbl_gpu_memory_used_bytes", "Memory of a GPU in use", labels=["gpu"]),
-        "memory.total": GaugeMetricFamily("pbl_gpu_memory_size_bytes", "Memory of a GPU", labels=["gpu"]),
+    of_gpus = {
+        "busy": GaugeMetricFamily("pbl_gpu_busy_ratio", "Fraction of time that a GPU works", labels=["gpu"]),
+        "used": GaugeMetricFamily("pbl_gpu_memory_used_bytes", "Memory of a GPU in use", labels=["gpu"]),
+        "size": GaugeMetricFamily("pbl_gpu_memory_size_bytes", "Memory of a GPU", labels=["gpu"]),
     }
-    for index, *values in gpus(*columns):
-        for (name, figure), value in zip(columns.items(), values, strict=True):
-            with contextlib.suppress(ValueError):  # "[N/A]": it does not measure that
-                figure.add_metric([index], float(value) * (0.01 if name == "utilization.gpu" else 2**20))
-    return [free, size, *columns.values()]
+    for one in gpu_use() or ():
+        for name in of_gpus.keys() & one.keys():
+            of_gpus[name].add_metric([one["gpu"]], one[name])
+    return [free, size, *of_gpus.values()]
 
 
 def figures(server: Any) -> list[GaugeMetricFamily]:

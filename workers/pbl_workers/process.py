@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import logging
 import os
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -27,6 +28,8 @@ log = logging.getLogger("pbl.worker")
 
 #: Exit code of a process whose self-test failed: starting another would not help.
 SELFTEST_FAILED = 3
+#: Exit code of a process whose GPU does not compute, such as one without free memory.
+DEVICE_FAILED = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +89,19 @@ class Options:
         return dataclasses.replace(one, resource=resource, gpus=gpus, processes=sharing)
 
 
+@contextlib.contextmanager
+def _ends_without_device() -> Iterator[None]:
+    """End the process with DEVICE_FAILED where its GPU does not compute."""
+    try:
+        yield
+    except Exception as error:
+        if not (reason := run_job.device_failure(error)):
+            raise
+        event(log, logging.CRITICAL, "the device does not compute", error=reason)
+        raise SystemExit(DEVICE_FAILED) from error
+
+
+@_ends_without_device()
 def work(options: Options, pipe: Connection) -> None:
     """Run a working process (`Options.of_process`): connect, run the self-test, work."""
     fewer_collections()

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import shortened
 from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
@@ -249,7 +250,7 @@ def reset(jobs: Any, reason: str = "", delay_s: float = 0.0, **counts: int) -> i
     cursor = jobs.connection.query(  # the condition is DataJoint's, which escapes values
         f"UPDATE {jobs.full_table_name} SET {columns}status='pending', host='', pid=0, error_stack=NULL,"  # noqa: S608
         f" error_message=%s, scheduled_time=CURRENT_TIMESTAMP(3) + INTERVAL %s MICROSECOND{jobs.where_clause()}",
-        args=(*counts.values(), reason[:2000], int(delay_s * 1e6)),
+        args=(*counts.values(), shortened(reason, 2000), int(delay_s * 1e6)),
     )
     return int(cursor.rowcount)
 

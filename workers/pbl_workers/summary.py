@@ -69,7 +69,7 @@ def rows(found: Summary) -> list[tuple[str, str]]:
     out.append(("workers alive", f"{len(state.workers)}{lost}"))
     out += [(f"cron {one.name}", one.text()) for one in state.cron]
     out += [(f"disk {name}", f"{free:.1f} of {total:.1f} GB free") for name, free, total in state.disks]
-    return out
+    return out + [row for machine in state.machines for row in machine.rows()]
 
 
 def as_text(found: Summary) -> str:

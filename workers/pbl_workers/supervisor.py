@@ -6,8 +6,9 @@ replaced, and the job that killed it is put back, or becomes an error row when i
 its time limit is ended with its process.
 
 By hand, although systemd and Kubernetes restart processes: they do not know which job a process worked on, so they
-cannot count its crashes, end it at its time limit, or put it back. Where every process dies at its start, the
-supervisor ends, and restarting it is left to them.
+cannot count its crashes, end it at its time limit, or put it back. Deaths are counted for each place of a process: one
+GPU without memory stops no other process. Only where every process dies at its start, the supervisor ends, and
+restarting it is left to them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import math
 import multiprocessing
 import os
 import signal
@@ -26,22 +28,23 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import shared_cores
-from pbl_schemas import connection
+from pbl_schemas import connection, worker
 
 from . import queue, recover, registry, run_job
+from .heartbeat import Heartbeat, Silent
 from .log import event
 from .metrics import Metrics
-from .process import SELFTEST_FAILED, Options, work
+from .process import DEVICE_FAILED, SELFTEST_FAILED, Options, work
 from .queue import Claim
 from .run_job import Outcome
 
 log = logging.getLogger("pbl.worker")
 
-#: Pause before a process that died is replaced (s): doubled up to the longest while processes keep dying.
+#: Pause before a process that died is replaced (s): doubled up to the longest while those in its place keep dying.
 RESTART_S = (0.5, 60.0)
 #: Lifetime of a process after which the pause begins again from the shortest (s).
 HEALTHY_S = 60.0
-#: After so many processes in a row that died earlier and without a job, the supervisor ends with an error.
+#: After so many processes in a row that died earlier and without a job, in every place, the supervisor ends.
 HOPELESS = 5
 #: Nice value of the other processes where one is for phones: it then gets nine tenths of each core that it wants.
 BATCH_NICE = 10
@@ -68,6 +71,29 @@ class _Child:
             self.jobs.pop(name, None)
 
 
+@dataclasses.dataclass
+class _Place:
+    """Place of a working process. deaths: in a row, as `HOPELESS` counts them. until: end of its pause
+    (`time.monotonic`) while no process has it."""
+
+    name: str
+    deaths: int = 0
+    pause_s: float = 0.0
+    until: float = 0.0
+    why: str = ""
+
+    def rest(self, why: str, healthy: bool, over_job: bool) -> None:
+        """Pause after a death."""
+        self.deaths = 0 if healthy or over_job else self.deaths + 1
+        shortest, longest = RESTART_S
+        self.pause_s = shortest if healthy or not self.pause_s else min(2 * self.pause_s, longest)
+        self.why, self.until = why, time.monotonic() + self.pause_s
+
+    def __str__(self) -> str:
+        then = f"starts again {self.pause_s:g} s after it died" if self.until < math.inf else "is not started again"
+        return f"{self.name} {then}: {self.why}{f', {self.deaths} times in a row' if self.deaths > 1 else ''}"
+
+
 class Supervisor:
     """Keeps `options.all_processes` working processes alive until told to stop; `run` returns the exit code."""
 
@@ -77,8 +103,8 @@ class Supervisor:
         self._children: list[_Child] = []
         # Read from the processes, not counted: a process may announce a job twice, and die without ending any.
         self.metrics.in_hand.set_function(lambda: sum(len(c.jobs) for c in self._children))
-        self._pause = RESTART_S[0]
-        self._stillborn = 0
+        self._places: dict[int, _Place] = {}
+        self._beats: Silent = Silent()
         self._stopping = False
         self._long_waits = False  # as a process for short recordings said
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
@@ -97,24 +123,33 @@ class Supervisor:
         """Watch until every process has ended (`once`), or until SIGTERM or SIGINT."""
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
-            self._children = [self._launch(number) for number in range(self.options.all_processes)]
-            code = 0
-            while self._children:
-                self._listen(0.5)
-                self._send_due()
-                self._end_overdue()
-                code = max(code, self._reap())
-                numbers = {c.number for c in self._children}
-                if numbers and min(numbers) >= self.options.processes and not self._stopping:
-                    self.stop()  # the processes for phones and long recordings do not outlive the others
-                self._serve_long()
-                self._settle()
-            return code
+            with Heartbeat(worker.SUPERVISOR) as self._beats:
+                return self._watch()
         finally:
             for s, handler in before.items():
                 signal.signal(s, handler)
 
+    def _watch(self) -> int:
+        self._children = [self._launch(number) for number in range(self.options.all_processes)]
+        code = 0
+        while self._places:
+            self._listen(0.5)
+            self._send_due()
+            self._end_overdue()
+            code = max(code, self._reap())
+            if self._places and min(self._places) >= self.options.processes and not self._stopping:
+                self.stop()  # the processes for phones and long recordings do not outlive the others
+            self._serve_long()
+            self._settle()
+        return code
+
     # ------------------------------------------------------------------------------------------------- processes
+    def _place(self, number: int) -> _Place:
+        if number not in self._places:
+            gpus = self.options.of_process(number).gpus
+            self._places[number] = _Place(f"process {number + 1}{f' (GPU {gpus[0]})' if gpus else ''}")
+        return self._places[number]
+
     def _launch(self, number: int) -> _Child:
         here, there = self._start.Pipe(duplex=False)
         options = self.options.of_process(number)
@@ -126,12 +161,13 @@ class Supervisor:
             with contextlib.suppress(OSError):  # it has ended
                 os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + BATCH_NICE)
         there.close()
+        self._place(number)
         return _Child(process, here, time.monotonic(), number=number)
 
     def _serve_long(self) -> None:
         """Start the process for long recordings that a lone process asked for, if there is none."""
         number, asked = self.options.processes + 1, self._long_waits and self.options.lone and not self._stopping
-        if asked and all(c.number != number for c in self._children):
+        if asked and number not in self._places:
             self._children.append(self._launch(number))
         self._long_waits = False
 
@@ -163,6 +199,8 @@ class Supervisor:
                         self._long_waits = True
                         continue
                     child.heard(job, outcome, self.options.limit_factor)
+                    if outcome is not None and outcome.what != run_job.LATER:
+                        self._place(child.number).deaths = 0
                     self.metrics.heard(job, outcome)
             except (EOFError, OSError):
                 child.pipe.close()
@@ -178,10 +216,13 @@ class Supervisor:
                 os.kill(child.process.pid, signal.SIGKILL)
 
     def _reap(self) -> int:
-        """Reap exited processes, handle their jobs, and replace those that should not have ended."""
+        """Reap exited processes, handle their jobs, and replace those that should not have ended, each after the pause
+        of its place."""
         code = 0
         for child in list(self._children):
+            place, healthy = self._place(child.number), time.monotonic() - child.started > HEALTHY_S
             if child.process.is_alive():
+                place.deaths *= not healthy
                 continue
             self._listen(0.0)  # its last messages
             child.process.join()
@@ -192,25 +233,30 @@ class Supervisor:
             elif exit_code and not self._stopping:
                 event(log, logging.ERROR, "process died", exit_code=exit_code, reason=_death(exit_code))
             if self._stopping or (exit_code == 0 and not child.jobs):
-                code = max(code, 1 if exit_code > 0 else 0)
+                code = max(code, int(exit_code > 0 and exit_code != DEVICE_FAILED))
+                del self._places[child.number]
                 continue
+            place.rest(_death(exit_code), healthy, bool(child.jobs))
             if exit_code == SELFTEST_FAILED:
-                return SELFTEST_FAILED
-            healthy = time.monotonic() - child.started > HEALTHY_S
-            self._stillborn = 0 if healthy or child.jobs else self._stillborn + 1
-            if self._stillborn >= HOPELESS:
-                event(log, logging.CRITICAL, "giving up", why=f"{HOPELESS} processes in a row died at their start")
-                self.stop()
-                code = 1
-                continue
-            if healthy:
-                self._pause = RESTART_S[0]
-            self.metrics.restarts.inc()
-            time.sleep(self._pause)
-            self._pause = min(2 * self._pause, RESTART_S[1])
-            if not self._stopping:
-                self._children.append(self._launch(child.number))
+                code, place.deaths, place.until = SELFTEST_FAILED, HOPELESS, math.inf
+            event(log, logging.WARNING, "replaced later", about=str(place))
+        if self._places and not self._stopping and all(p.deaths >= HOPELESS for p in self._places.values()):
+            event(log, logging.CRITICAL, "giving up", why="; ".join(map(str, self._places.values())))
+            self.stop()
+            code = max(code, 1)
+        self._wake()
         return code
+
+    def _wake(self) -> None:
+        """Start processes in places whose pause is over, and report the others."""
+        for number in self._places.keys() - {c.number for c in self._children}:
+            if self._stopping:
+                del self._places[number]
+            elif time.monotonic() >= self._places[number].until:
+                self.metrics.restarts.inc()
+                self._children.append(self._launch(number))
+        busy = {c.number for c in self._children}
+        self._beats.doing("; ".join(str(p) for n, p in sorted(self._places.items()) if n not in busy))
 
     def _settle_jobs(self, child: _Child, exit_code: int) -> None:
         reason = child.why or _death(exit_code)
@@ -240,7 +286,10 @@ def _limit_s(job: Claim, factor: float) -> float:
     return registry.stage_of(job.table).limit_s * factor
 
 
+_EXITS = {SELFTEST_FAILED: "its self-test failed", DEVICE_FAILED: "its GPU does not compute, or has no memory free"}
+
+
 def _death(exit_code: int) -> str:
     if exit_code < 0:
         return f"signal {signal.Signals(-exit_code).name}"
-    return f"exit code {exit_code}"
+    return _EXITS.get(exit_code, f"exit code {exit_code}")

@@ -62,6 +62,7 @@ def lines(state: Status) -> list[str]:
         out.append(f"{state.workers_lost} workers lost in the last hour: their heartbeats ended, they did not")
     out += [f"cron {one.name}: {one.text()}" for one in state.cron]
     out += [f"disk {name}: {free:.1f} of {total:.1f} GB free" for name, free, total in state.disks]
+    out += [f"{name}: {text}" for machine in state.machines for name, text in machine.rows()]
     if state.unfinished:
         ages, sizes = zip(*state.unfinished, strict=True)
         out.append(

@@ -133,6 +133,28 @@ class Cron:
 
 
 @dataclasses.dataclass(frozen=True)
+class Machine:
+    """A machine with live workers. gpus: its GPUs, as `resources.gpu_use` has them, None: not known. resting: of each
+    worker, which of its processes wait after they died."""
+
+    host: str
+    gpus: list[dict[str, Any]] | None = None
+    resting: list[str] = dataclasses.field(default_factory=list)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """For people: what it is about, and its state."""
+        out = [(f"worker {self.host}", text) for text in self.resting]
+        if self.gpus is None:
+            return [*out, (f"GPUs of {self.host}", "unknown")]
+        for gpu in self.gpus:
+            use = [f"{gpu['busy']:.0%} busy"] if "busy" in gpu else []
+            if {"used", "size"} <= gpu.keys():
+                use.append(f"{gpu['used'] / 1e9:.1f} of {gpu['size'] / 1e9:.1f} GB used")
+            out.append((f"GPU {gpu['gpu']} of {self.host}", ", ".join(use) or "unknown"))
+        return out
+
+
+@dataclasses.dataclass(frozen=True)
 class Status:
     """The whole state."""
 
@@ -152,6 +174,7 @@ class Status:
     disks: list[tuple[str, float, float]] = dataclasses.field(default_factory=list)
     #: Ages (s) and lengths (byte) of what lies in the archive of this machine without being registered.
     unfinished: list[tuple[float, int]] = dataclasses.field(default_factory=list)
+    machines: list[Machine] = dataclasses.field(default_factory=list)
 
 
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
@@ -191,6 +214,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         cron_passes(server),
         disks(),
         [(time.time() - one.last_s, one.n_bytes) for one in unfinished(archive_dir())],
+        machines(),
     )
 
 
@@ -272,19 +296,36 @@ def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
     return {str(stage): 3600.0 * float(n) / max(float(seconds), 60.0) for stage, n, seconds in rows}
 
 
-def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
+#: Condition on rows of `Worker`: their heartbeat is recent.
+_ALIVE = "worker_stopped IS NULL AND worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL 60 SECOND"
+#: And: they take jobs.
+_TAKES_JOBS = f"worker_resource NOT IN ('{worker.CRON}', '{worker.SUPERVISOR}')"
+
+
+def live_workers() -> list[dict[str, Any]]:
     """Return the workers with a recent heartbeat: host, process, resource, current job."""
-    alive = worker.Worker & "worker_stopped IS NULL" & f"worker_resource != '{worker.CRON}'"
-    alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
     names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
+    alive = worker.Worker & _ALIVE & _TAKES_JOBS
     return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def machines() -> list[Machine]:
+    """Return the machines on which workers live, by name."""
+    out: dict[str, Machine] = {}
+    alive = worker.Worker & _ALIVE & f"worker_resource != '{worker.CRON}'"
+    for row in alive.to_dicts(order_by="worker_host, worker_seen"):
+        host, of_supervisor = str(row["worker_host"]), row["worker_resource"] == worker.SUPERVISOR
+        known = out.get(host, Machine(host))
+        resting = [*known.resting, row["worker_doing"]] if of_supervisor and row["worker_doing"] else known.resting
+        out[host] = Machine(host, known.gpus if row["worker_gpus"] is None else row["worker_gpus"], resting)
+    return list(out.values())
 
 
 def worker_counts(server: Any) -> tuple[int, int]:
     """Return the numbers of workers that live, and of those whose heartbeat ended within the last hour without that
     they did in order."""
     silent = f"TIMESTAMPDIFF(SECOND, worker_seen, CURRENT_TIMESTAMP) FROM {worker.Worker.full_table_name}"
-    rows = server.query(f"SELECT {silent} WHERE worker_stopped IS NULL AND worker_resource != %s", args=(worker.CRON,))
+    rows = server.query(f"SELECT {silent} WHERE worker_stopped IS NULL AND {_TAKES_JOBS}")
     ages = [float(age) for (age,) in rows.fetchall()]
     return sum(age < LOST_S for age in ages), sum(LOST_S <= age < 3600.0 for age in ages)
 
@@ -400,17 +441,8 @@ def _errors(table: Any, most: int) -> list[ErrorRow]:
     out, jobs = [], jobs_of(table)
     for key, about, row in _keyed(jobs, jobs.errors.to_dicts(limit=most)):
         error = stored_error(row["error_message"])
-        out.append(
-            ErrorRow(
-                table=table.__name__,
-                key=key,
-                about=about,
-                code=error.code,
-                found=error.found,
-                next_step=error.next_step,
-                stack=str(row["error_stack"] or ""),
-            )
-        )
+        said = (error.code, error.found, error.next_step)
+        out.append(ErrorRow(table.__name__, key, about, *said, str(row["error_stack"] or "")))
     return out
 
 
@@ -438,14 +470,7 @@ def _waiting(most: int) -> list[Waiting]:
     for row in rows:
         key = {k: row[k] for k in ("video_id", "tracking_method")}
         persons = sorted(seen.get((int(row["video_id"]), row["tracking_method"]), []))
-        out.append(
-            Waiting(
-                video_id=int(row["video_id"]),
-                about=row["video_name"],
-                reason=row["choice_reason"],
-                persons=persons,
-                next_step=tracking.choose_command(key, "|".join(map(str, persons)), several),
-                look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
-            )
-        )
+        choose = tracking.choose_command(key, "|".join(map(str, persons)), several)
+        look = f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg"
+        out.append(Waiting(int(row["video_id"]), row["video_name"], row["choice_reason"], persons, choose, look))
     return out

@@ -14,7 +14,7 @@ import numpy as np
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Filming
-from pbl_pipeline.names import check_label, is_plain
+from pbl_pipeline.names import check_label, is_plain, shortened
 from pbl_pipeline.words import UNUSABLE, unit_of
 
 from .. import fit, gait, gdi, lab, session, study, video
@@ -100,7 +100,7 @@ def freeze(
         chain = _chain(visits, with_keys(methods or {}))
         members = [] if cohort is None else (study.CohortMember & {"cohort": cohort}).to_dicts()
         rows = _decided(visits, chain, members)
-        said = " ".join(filter(None, (note, _absent(visits, members))))[:1000]
+        said = shortened(" ".join(filter(None, (note, _absent(visits, members)))), 1000)
         about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
@@ -331,7 +331,7 @@ def _absent(visits: Any, members: Sequence[Mapping[str, Any]]) -> str:
 
 def _line(text: str) -> str:
     text = " ".join(text.split())
-    return (text if is_plain(text) else ascii(text))[:200]
+    return shortened(text if is_plain(text) else ascii(text), 200)
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
@@ -385,7 +385,7 @@ def _frames_of(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     instruments = frame_of(study.ClinicalInstrument & (study.ClinicalScore & ids).proj("instrument"))
     named = instruments.rename(columns=lambda c: c.removeprefix("instrument_").replace("minimal_change", "mic"))
     sources = [
-        "; ".join(filter(None, (a, f"minimal important change: {b}" if b else "")))[:200]
+        shortened("; ".join(filter(None, (a, f"minimal important change: {b}" if b else ""))), 200)
         for a, b in zip(instruments["instrument_source"], instruments["minimal_change_source"], strict=True)
     ]
     wanted = ["instrument", "unit", "low", "high", "higher_is_better", "ordinal", "mic", "classes", "mic_classes"]

@@ -53,6 +53,7 @@ STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNI
     "FILE_UNWRITABLE": 507,
     "STORE_FULL": 507,
     "MACHINE_SHORT": 503,
+    "NOT_QUEUED": 503,
 }
 #: Cache header of `vendor/`: its file names carry their versions.
 _KEEP = "public, max-age=31536000, immutable"
