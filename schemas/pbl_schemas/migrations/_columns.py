@@ -23,7 +23,7 @@ def added(conn: Any, stage: str, table: str, columns: Mapping[str, tuple[str, st
     there = {str(row[0]) for row in rows.fetchall()}
     add = f"ALTER TABLE `{schema}`.`{table}` ADD COLUMN"
     return [
-        f"{add} {name} {_SQL.get(kind, kind)} NULL COMMENT ':{kind}:{comment.replace(chr(39), 2 * chr(39))}' AFTER {before}"
+        f"{add} {name} {_SQL.get(kind, kind)} NULL COMMENT ':{kind}:{comment}' AFTER {before}"
         for name, (kind, comment, before) in columns.items()
         if there and name not in there
     ]
