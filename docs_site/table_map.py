@@ -61,7 +61,7 @@ the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it 
 
 - *origin*, where a row of each computed table comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
 - *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
-  `_method_sha`, hash of all these. Lookup tables of frozen parameters have these columns only: @METHOD@
+  `_method_sha`, hash of all these. Lookup tables of frozen parameters have these columns only (in brackets: their prefix): @METHOD@
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
   `_check_threshold` (its unit); `_check_advice`: what to do about it. Parts with these columns only: @CHECK@
 
@@ -126,7 +126,8 @@ def table_map() -> str:
     alone = {name: word for name, cls in tables().items() if (word := _alone(cls))}
     start = _START
     for word in _GROUPS:
-        start = _filled(start, f"@{word.upper()}@", _names([name for name in alone if alone[name] == word]))
+        named = (f"`{name}` ({_prefix(tables()[name], word)})" for name in alone if alone[name] == word)
+        start = _filled(start, f"@{word.upper()}@", ", ".join(named))
     lines = [*start.splitlines(), "", *joins()]
     stage, written = "", {}
     for name, cls in tables().items():
@@ -145,6 +146,11 @@ def _alone(cls: Any) -> str:
     own = [c[0] for c in columns(cls)]
     word = _group(own, 0) if own else ""
     return word if word and len(own) == len(_GROUPS[word]) else ""
+
+
+def _prefix(cls: Any, word: str) -> str:
+    """What stands before the ending of each column of a table that has only those of a group."""
+    return columns(cls)[0][0].removesuffix(_GROUPS[word][0])
 
 
 def _filled(text: str, place: str, words: str) -> str:

@@ -102,4 +102,5 @@ class Intrinsics:
     focal_sd_px: float | None = column(
         "camera_focal_sd", "(px) standard deviation of the focal length, null when unknown"
     )
-    note: str = column("camera_note", "file or rule they come from", "varchar(255)", cut=True)
+    # The hash of a calibration holds it: cut as in stored rows.
+    note: str = column("camera_note", "file or rule they come from", "varchar(255)", cut="tag")

@@ -126,7 +126,7 @@ class Camera:
         """Return the camera of the figures of a calibration."""
         matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
         rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
-        return cls(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
+        return cls(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}", rel_sd)
 
     def measured(self, size_px: tuple[int, int]) -> Intrinsics:
         """Return the figures of a calibration, which holds for pictures of a size (width, height)."""
