@@ -47,14 +47,15 @@ LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --genera
 	  --no-emit-find-links --upgrade --custom-compile-command "make lock"
 
 IMAGE := workers/deploy/requirements-cpu.lock
+OF_IMAGE := --extra s3 --extra figures --extra depth# the extras of what workers do
 # Only what that lock lacks, in its versions: the longer locks begin with `-r`. uv lists the others after an empty line.
 BEYOND = --constraint $(IMAGE) $$(sed -n 's/^\([a-z0-9._-]*\)==.*/--no-emit-package \1/p' $(IMAGE))
 
 lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' three
 	$(BIN)/pip install --quiet uv
-	$(LOCK) --extra s3 --extra figures --output-file $(IMAGE) pyproject.toml
+	$(LOCK) $(OF_IMAGE) --output-file $(IMAGE) pyproject.toml
 	$(LOCK) --extra dev $(BEYOND) --output-file requirements.lock pyproject.toml
-	$(LOCK) --extra s3 --extra figures --extra gpu $(BEYOND) --output-file workers/deploy/requirements-gpu.lock pyproject.toml
+	$(LOCK) $(OF_IMAGE) --extra gpu $(BEYOND) --output-file workers/deploy/requirements-gpu.lock pyproject.toml
 	sed -i -e '1i -r $(IMAGE)' -e '/^$$/,$$d' requirements.lock
 	sed -i -e '1i -r $(notdir $(IMAGE))' -e '/^$$/,$$d' workers/deploy/requirements-gpu.lock
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])' \

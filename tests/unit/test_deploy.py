@@ -125,6 +125,7 @@ def test_no_lock_repeats_what_the_lock_of_the_image_has():
         )
         assert packages
         assert not packages & of_image
+        assert {"s3fs", "matplotlib", "lzfse"} <= of_image  # the extras of what workers do
 
 
 def test_a_worker_has_longer_to_end_than_it_takes():
