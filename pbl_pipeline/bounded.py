@@ -29,7 +29,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, causes
 
 MIB = 1 << 20
 #: Bytes of a text (JSON, CSV, TRC, MOT), unpacked: an hour of a sensor at 100 Hz.
@@ -178,8 +178,9 @@ def opened_zip(path: str | Path, directory: int = _MAX_DIRECTORY) -> Iterator[zi
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except (*DAMAGED, OSError) as error:  # OSError: places that no file has
-            if getattr(error, "errno", None) in _OF_MACHINE:
-                raise
+            for seen in causes(error):  # `zipfile` hides one
+                if getattr(seen, "errno", None) in _OF_MACHINE:
+                    raise seen from None
             raise ValueError(f"no readable archive: {error}") from error
 
 
@@ -190,7 +191,7 @@ def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, at_most: int)
     if member.file_size > at_most:
         raise ValueError(f"{member.filename} has {_size(member.file_size)}, at most {_size(at_most)} are read")
     data = bytearray()
-    with archive.open(member) as file:
+    with of_machine(archive.filename), archive.open(member) as file:
         while piece := file.read(MIB):
             data += piece
     if len(data) != member.file_size:
@@ -272,13 +273,19 @@ def _cost(count: int, dtype: np.dtype) -> int:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[BinaryIO]:
-    """A regular file; a pipe or device is refused and not waited for. Raises `PblError` FILE_MISSING for an error that
-    says nothing about the file."""
+    """A regular file; a pipe or device is refused and not waited for. Raises as `of_machine`."""
+    opener = lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))  # noqa: E731
+    with of_machine(path), open(path, "rb", opener=opener) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+        yield file
+
+
+@contextlib.contextmanager
+def of_machine(path: str | Path | None) -> Iterator[None]:
+    """Raise `PblError` FILE_MISSING for an error of the block that says nothing about the file."""
     try:
-        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise OSError(errno.EINVAL, "it is not a regular file", str(path))
-            yield file
+        yield
     except OSError as error:
         if error.errno not in _OF_MACHINE:
             raise

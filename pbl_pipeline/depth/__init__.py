@@ -2,5 +2,5 @@
 
 from .packed import pack, sha256_of_recording
 from .points import PointDepths, at_points
-from .read import DepthFile, read_depth, with_recordings
+from .read import DepthFile, check_recording, read_depth, with_recordings
 from .recording import Depth

@@ -43,7 +43,7 @@ def read_folder(
 ) -> Depth:
     """Read a folder of depth pictures, or its zip, in the order of the numbers in their names. `scale_m`: metres of one
     step, None of Stray Scanner's; `time_s` (T,): of the video's frames from 0 on, each of which has a picture in other
-    folders; `called`: its name in errors. Raises `PblError` DEPTH_FILE."""
+    folders, empty without a video; `called`: its name in errors. Raises `PblError` DEPTH_FILE."""
     wrong = functools.partial(depth_error, key=called or folder)
     inside, stray, turn = "", scale_m is None, 0
     try:
@@ -67,6 +67,7 @@ def read_folder(
         if not files:
             raise wrong("no depth pictures", "a .png or .npy of each frame")
         if not stray:
+            time_s = time_s if len(time_s) else np.arange(len(files), dtype=float)
             check_count(len(files), len(time_s), called or folder)
             time_s = time_s[: len(files)]
         else:

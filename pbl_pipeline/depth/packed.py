@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,10 +23,11 @@ Get = Callable[[str, int], bytes]
 def names_in(path: Path) -> list[str]:
     """Return the paths of the files in a folder or a zip. Raises OSError, ValueError as `bounded`."""
     if path.is_dir():
-        found = (*path.glob("*"), *path.glob("*/*"))
-        return sorted(f.relative_to(path).as_posix() for f in found if f.is_file())
+        with bounded.of_machine(path):
+            found = (*path.glob("*"), *path.glob("*/*"))
+            return sorted(f.relative_to(path).as_posix() for f in found if f.is_file())
     with bounded.opened_zip(path, _DIRECTORY) as archive:
-        return sorted(archive.namelist())
+        return sorted(_members(archive))
 
 
 @contextlib.contextmanager
@@ -35,7 +37,16 @@ def opened(path: Path) -> Iterator[Get]:
         yield lambda name, most: bounded.read_bytes(path / name, most)
         return
     with bounded.opened_zip(path, _DIRECTORY) as archive:
-        yield lambda name, most: bytes(bounded.read_member(archive, archive.getinfo(name), most))
+        members = _members(archive)
+        yield lambda name, most: bytes(bounded.read_member(archive, members[name], most))
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Members by their paths in the folder that was packed: below the only folder on top, as Finder and Explorer do."""
+    found = [m for m in archive.infolist() if not m.is_dir() and not m.filename.startswith("__MACOSX/")]
+    tops = {m.filename[: m.filename.find("/") + 1] for m in found}
+    top = tops.pop() if len(tops) == 1 else ""
+    return {m.filename.removeprefix(top): m for m in found}
 
 
 def pack(folder: Path, copy: Path) -> Path:

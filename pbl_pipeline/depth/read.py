@@ -59,13 +59,23 @@ def read_depth(
     time, shown = np.asarray(time_s, float) - float(time_s[0]), Path(called or path)
     if not path.exists():
         raise PblError("FILE_MISSING", "no such file or folder", "a depth recording", "check the path", shown)
-    if shown.suffix.lower() != _RECORD3D or path.is_dir():
-        found = read_folder(path, time, size_px, scale_m, shown)
-    elif scale_m is not None:
-        raise depth_error("a scale for a file", "a scale for a folder of 16-bit pictures", key=shown)
-    else:
-        found = read_record3d(path, size_px, shown)
+    found = _read(path, time, size_px, scale_m, shown)
     return dataclasses.replace(checked(found, time), sha256=sha256_of_recording(path))
+
+
+def check_recording(given: DepthFile) -> None:
+    """Read the first picture, and what can be told without a video; files of other kinds have no scale. Raises
+    `PblError` DEPTH_FILE; PACKAGE_MISSING as `read_depth`."""
+    if given.known or given.scale_m is not None:
+        next(_read(given.file, np.zeros(0), (1, 1), given.scale_m, given.file).read([0]))
+
+
+def _read(path: Path, time_s: np.ndarray, size_px: tuple[int, int], scale_m: float | None, shown: Path) -> Depth:
+    if shown.suffix.lower() != _RECORD3D or path.is_dir():
+        return read_folder(path, time_s, size_px, scale_m, shown)
+    if scale_m is not None:
+        raise depth_error("a scale for a file", "a scale for a folder of 16-bit pictures", key=shown)
+    return read_record3d(path, size_px, shown)
 
 
 def with_recordings(

@@ -37,7 +37,7 @@ def read_record3d(path: Path, size_px: tuple[int, int], called: Path | None = No
     def picture(get: Get, name: str, kind: str | type) -> np.ndarray:
         try:
             return np.frombuffer(lzfse.decompress(get(name, _MOST)), kind).reshape(height, width)
-        except (ValueError, lzfse.error, *bounded.DAMAGED) as error:
+        except (OSError, ValueError, lzfse.error, *bounded.DAMAGED) as error:
             raise depth_error(f"{name}: {error}", f"{width}x{height} values", key=shown) from error
 
     try:

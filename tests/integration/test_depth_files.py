@@ -69,16 +69,35 @@ def test_a_depth_recording_is_part_of_the_fit_of_its_visit(tmp_path: Path):
     assert len(video.DepthVideo()) == 0
 
 
-def test_a_wrong_recording_is_an_error_of_its_own_fit(tmp_path: Path):
+def test_a_recording_that_cannot_be_read_deletes_nothing(tmp_path: Path):
     pytest.importorskip("lzfse")
+    one, folder = chain.small_video(tmp_path, "a"), chain.depth_pictures(tmp_path / "depth")
+    (tmp_path / "broken.r3d").write_bytes(b"no zip")
+    (tmp_path / "walk\u202efdp").symlink_to(folder)
+    ingested(one, "--depth", f"0.001={folder}")
+    fitted()
+    for given, code, found in (
+        (folder, "DEPTH_FILE", "no recording of Stray Scanner"),
+        (f"0={folder}", "DEPTH_FILE", "a scale of 0 m"),
+        (f"0.001={one}", "DEPTH_FILE", "no folder or zip"),
+        (f"0.001={tmp_path / 'broken.r3d'}", "DEPTH_FILE", "a scale for a file"),
+        (tmp_path / "broken.r3d", "DEPTH_FILE", "no recording of Record3D"),
+        (f"0.001={tmp_path / 'walk'}\u202efdp", "USAGE", "depth recording"),
+    ):
+        told = pbl("ingest", one, "--subject", "P001", "--depth", given)
+        assert (told.code, told.error_code) == (1, code), given
+        assert found in told.err
+    assert len(fit.SessionFit()) == len(video.DepthVideo()) == 1
+
+
+def test_a_wrong_recording_is_an_error_of_its_own_fit(tmp_path: Path):
     one, two = (chain.small_video(tmp_path, name) for name in ("a", "b"))
     empty = chain.depth_pictures(tmp_path / "zeros", 0.0)
-    (tmp_path / "broken.r3d").write_bytes(b"no zip")
+    few = chain.depth_pictures(tmp_path / "few", n=3)
     assert pbl("ingest", two, "--subject", "P002").code == 0
     for given, found in (
         (f"0.001={empty}", "depths of 0 in all pictures"),
-        (empty, "no recording of Stray Scanner"),
-        (tmp_path / "broken.r3d", "no recording of Record3D"),
+        (f"0.001={few}", "3 depth pictures for"),
     ):
         ingested(one, "--depth", given)
         assert errors(populate()) == {"SessionFit": {"DEPTH_FILE": 1}}

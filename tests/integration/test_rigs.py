@@ -271,7 +271,7 @@ def test_trials_that_cannot_be_are_refused(rig: None, tmp_path: Path):
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
     assert outcomes(ingest([one], VisitRecord("P001", camera_file=toml))) == ["USAGE"]
-    depth = Sensors(depth=DepthFile(tmp_path))
+    depth = Sensors(depth=DepthFile(chain.depth_pictures(tmp_path / "depth"), 0.001))
     assert outcomes(ingest([one], VisitRecord("P001"), files=[depth])) == ["USAGE"]
     assert len(video.Video()) == 3
 

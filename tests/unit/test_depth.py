@@ -1,7 +1,10 @@
 """Depth recordings: each format, bad input, depths at keypoints, and the way into a fit."""
 
 import dataclasses
+import errno
+import io
 import json
+import os
 import struct
 import zipfile
 from collections.abc import Callable
@@ -13,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pbl_pipeline import bounded
 from pbl_pipeline.body import capsules, load_body, ray_lengths
 from pbl_pipeline.cli.options import depth_files
 from pbl_pipeline.depth import (
@@ -20,6 +24,7 @@ from pbl_pipeline.depth import (
     DepthFile,
     PointDepths,
     at_points,
+    check_recording,
     pack,
     read_depth,
     sha256_of_recording,
@@ -418,6 +423,53 @@ def test_a_zip_is_read_as_its_folder(tmp_path: Path):
     with pytest.raises(PblError, match="4 depth pictures for 12") as caught:
         read_depth(tmp_path / "cut.zip", TIME_S, SIZE_PX, 0.001, "walk")
     assert caught.value.key == "walk"
+
+
+def test_a_zip_with_one_folder_on_top_is_read(tmp_path: Path):
+    """As Finder and Explorer make it."""
+    for name, folder, scale in (("s", stray(tmp_path / "s"), None), ("p", write(tmp_path / "p", millimetres), 0.001)):
+        path = tmp_path / f"{name}.zip"
+        with zipfile.ZipFile(path, "w") as archive:
+            for file in (folder, *folder.rglob("*")):
+                archive.write(file, Path(folder.name) / file.relative_to(folder))
+            archive.writestr(f"__MACOSX/{folder.name}/._odometry.csv", b"a")
+        check_recording(DepthFile(path, scale))
+        (depth, _) = next(read_depth(path, TIME_S, SIZE_PX, scale).read([7]))
+        np.testing.assert_allclose(depth, depths(7), atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["zip", "r3d", "folder"])
+def test_a_fault_of_the_machine_is_none_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str):
+    """Wherever the disk fails, and where no file can be opened any more."""
+    if form == "r3d":
+        pytest.importorskip("lzfse")
+    folder = stray(tmp_path / "a")
+    given = {"zip": lambda: pack(folder, tmp_path / "a.zip"), "r3d": lambda: record3d(tmp_path / "a.r3d")}
+    path = given.get(form, lambda: folder)()
+    n_read, at = 0, 0
+
+    def count() -> None:
+        nonlocal n_read
+        n_read += 1
+        if n_read == at:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    class Failing(io.BufferedReader):
+        def read(self, size: int | None = -1, /) -> bytes:
+            count()
+            return super().read(size)
+
+    def opened(path: Path, *_: object, **__: object) -> Failing:
+        count()
+        return Failing(io.FileIO(path))
+
+    monkeypatch.setattr(bounded, "open", opened, raising=False)
+    check_recording(DepthFile(path))
+    for at in range(1, n_read + 1):  # noqa: B007
+        n_read = 0
+        with pytest.raises(PblError) as caught:
+            check_recording(DepthFile(path))
+        assert caught.value.code == "FILE_MISSING", at
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_packed, zipped
+from pbl_pipeline.names import check_label
 from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
 
@@ -51,15 +52,20 @@ class Sensors:
     def read(self) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and their sums, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT
-        for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
-        from pbl_pipeline.depth import sha256_of_recording
+        for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording`; SENSOR_LOG, USAGE as `read_given`.
+        """
+        from pbl_pipeline.depth import check_recording, sha256_of_recording
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
         depth = {self.depth.file} if self.depth is not None else set()
+        for path in depth:
+            check_label("name of the depth recording", path.name, 255)
         for path in (*depth, *(given.file for given in self.imu)):
             if str(path) != NONE and not path.is_dir():
                 _check_there(path)
+        if self.depth is not None and str(self.depth.file) != NONE:
+            check_recording(self.depth)
         logs = iter(read_given([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
