@@ -10,7 +10,7 @@ import secrets
 import shutil
 import time
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ import numpy as np
 from pbl_pipeline.bounded import npz_fields, read_npz
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.names import is_plain
-from pbl_pipeline.temporary import new_folder
 
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
@@ -36,14 +35,6 @@ def sha256_of(path: str | Path) -> str:
     """SHA-256 of a file as 64 hex digits, computed in pieces. Raises OSError."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def sha256_packed(path: Path, pack: Callable[[Path, Path], Path]) -> str:
-    """SHA-256 of a file, or of a folder's copy that `pack` writes."""
-    if path.is_file():
-        return sha256_of(path)
-    with new_folder() as folder:
-        return sha256_of(pack(path, folder / "copy.zip"))
 
 
 def zipped(folder: Path, copy: Path, names: Iterable[str], how: int = zipfile.ZIP_STORED) -> Path:

@@ -1,19 +1,26 @@
 """Depth recordings in the tables: each is part of the fit of its visit, which is computed anew with or without it."""
 
 import dataclasses
+import errno
+import os
+import tempfile
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pbl_pipeline.depth import sha256_of_recording
+from pbl_pipeline import depth
+from pbl_pipeline.depth import DepthFile, sha256_of_recording
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import session_fit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.visit.files import visit_facts
 from pbl_schemas import connection, fit, load_visit, video
+from pbl_schemas.intake import Sensors, VisitRecord, ingest, registration
 from pbl_schemas.job_errors import stored_error
 from pbl_schemas.rows import InputChanged
+from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
 from research.walker.depths import depth_recording
 from tests import StandIn, not_none
@@ -88,6 +95,49 @@ def test_a_recording_that_cannot_be_read_deletes_nothing(tmp_path: Path):
         assert (told.code, told.error_code) == (1, code), given
         assert found in told.err
     assert len(fit.SessionFit()) == len(video.DepthVideo()) == 1
+
+
+def test_a_folder_is_packed_once_and_outside_the_transaction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is stored has the hash of its row, also where the folder changes meanwhile."""
+    path, folder = chain.small_video(tmp_path, "a"), chain.depth_pictures(tmp_path / "depth")
+    sha256, work = sha256_of_recording(folder), registration.in_transaction
+
+    def changed(*args, **named):
+        (folder / "0.png").write_bytes(b"other pictures")
+        return work(*args, **named)
+
+    monkeypatch.setattr(registration, "in_transaction", changed)
+    ingested(path, "--depth", f"0.001={folder}")
+    assert sha256_of_recording(folder) != sha256
+    row = video.DepthVideo.fetch1()
+    with stored_file(file_ref(row["depth_file"])) as kept:
+        assert row["depth_sha256"] == sha256_of(kept) == sha256
+        assert row["depth_size"] == kept.stat().st_size
+    assert not list(Path(tempfile.gettempdir()).glob(f"pbl-tmp-{os.getpid()}-*/*.zip"))
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(errno.ENOSPC, "STORE_FULL"), (errno.EACCES, "FILE_MISSING"), (errno.ENOENT, "FILE_MISSING")]
+)
+def test_a_folder_that_cannot_be_packed_stops_no_other_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: str
+):
+    paths = [chain.small_video(tmp_path, name) for name in ("a", "b")]
+    bad, good = (chain.depth_pictures(tmp_path / name) for name in ("bad", "good"))
+    pack = depth.pack
+
+    def failing(folder: Path, copy: Path) -> Path:
+        pack(folder, copy)
+        if folder == bad:
+            raise OSError(number, os.strerror(number), folder / "0.png")
+        return copy
+
+    monkeypatch.setattr(depth, "pack", failing)
+    files = [Sensors(depth=DepthFile(folder, 0.001)) for folder in (bad, good)]
+    refused, other = ingest(paths, VisitRecord("P001"), files=files)
+    assert (not_none(refused.error).code, other.status) == (code, "registered")
+    assert [str(name) for name in video.DepthVideo.to_arrays("depth_name")] == ["good"]
+    assert not list(Path(tempfile.gettempdir()).glob(f"pbl-tmp-{os.getpid()}-*/*.zip"))
 
 
 def test_a_wrong_recording_is_an_error_of_its_own_fit(tmp_path: Path):

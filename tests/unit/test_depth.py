@@ -425,6 +425,21 @@ def test_a_zip_is_read_as_its_folder(tmp_path: Path):
     assert caught.value.key == "walk"
 
 
+def test_a_folder_is_packed_as_far_as_its_zip_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = write(tmp_path / "a", millimetres)
+    size = zipfile.ZipFile(pack(folder, tmp_path / "a.zip")).start_dir
+    for limit, least, shown in (("ZIP64_LIMIT", size, "of 0.00 GiB"), ("ZIP_FILECOUNT_LIMIT", N, "12 files")):
+        with monkeypatch.context() as patch:
+            patch.setattr(zipfile, limit, least)
+            check_recording(DepthFile(pack(folder, tmp_path / "b.zip"), 0.001))
+            patch.setattr(zipfile, limit, least - 1)
+            with pytest.raises(PblError, match="DEPTH_FILE") as caught:
+                pack(folder, tmp_path / "c.zip")
+            assert shown in caught.value.found
+            assert not (tmp_path / "c.zip").exists()
+            assert sha256_of_recording(folder)  # also of what only the tables do not take
+
+
 def test_a_zip_with_one_folder_on_top_is_read(tmp_path: Path):
     """As Finder and Explorer make it."""
     for name, folder, scale in (("s", stray(tmp_path / "s"), None), ("p", write(tmp_path / "p", millimetres), 0.001)):
@@ -465,7 +480,7 @@ def test_a_fault_of_the_machine_is_none_of_the_recording(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(bounded, "open", opened, raising=False)
     check_recording(DepthFile(path))
-    for at in range(1, n_read + 1):  # noqa: B007
+    for at in range(1, n_read + 1):
         n_read = 0
         with pytest.raises(PblError) as caught:
             check_recording(DepthFile(path))

@@ -158,6 +158,9 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
             done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
         except PblError as error:
             done += [Registered(path, "refused", error=error) for path in recording.paths]
+        finally:
+            if sensors := getattr(recording, "sensors", None):
+                sensors.remove_copies()
     if len(done) > PART:
         catalog.analyse()
     return done

@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import sha256_packed, zipped
+from pbl_pipeline.files import sha256_of, zipped
 from pbl_pipeline.names import check_label
 from pbl_pipeline.records import number
-from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from .. import fit, keypoints, session, video
+from ..job_errors import store_full
 from ..queues import forget_errors
 from ..rows import counted, delete_below, utc_now
 from ..transactions import in_transaction
@@ -31,15 +32,24 @@ NONE = "none"
 _NOT_READ = ", kept and not read: not a folder, .r3d or zip (docs/depth.md)"
 
 
+class Kept(NamedTuple):
+    """A file, or the zip of a folder, as it goes to the store, with its SHA-256."""
+
+    file: Path
+    sha256: str
+
+
 @dataclasses.dataclass(frozen=True)
 class Sensors:
     """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; depth: a recording, or
-    `NONE`; imu: sensors that the person wore at its visit; sums: SHA-256 of the files, once they were read."""
+    `NONE`; imu: sensors that the person wore at its visit; kept: what goes to the store of each kind and path, once
+    they were read; room: the folder of their copies, until `remove_copies`."""
 
     attitude: Path | None = None
     depth: DepthFile | None = None
     imu: Sequence[Given] = ()
-    sums: Mapping[Path, str] = dataclasses.field(default_factory=dict)
+    kept: Mapping[tuple[str, Path], Kept] = dataclasses.field(default_factory=dict)
+    room: TemporaryFolder | None = None
 
     def __bool__(self) -> bool:
         return self.attitude is not None or self.depth is not None or bool(self.imu)
@@ -51,10 +61,11 @@ class Sensors:
 
     def read(self) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
-        the sensors in them and their sums, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT
-        for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording`; SENSOR_LOG, USAGE as `read_given`.
+        the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
+        FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
+        USAGE as `read_given`; STORE_FULL: no room for the zip of a folder.
         """
-        from pbl_pipeline.depth import check_recording, sha256_of_recording
+        from pbl_pipeline.depth import check_recording, pack
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
@@ -64,15 +75,34 @@ class Sensors:
         for path in (*depth, *(given.file for given in self.imu)):
             if str(path) != NONE and not path.is_dir():
                 _check_there(path)
-        if self.depth is not None and str(self.depth.file) != NONE:
-            check_recording(self.depth)
         logs = iter(read_given([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        files = {self.attitude, *(given.file for given in imu)} - {None, Path(NONE)}
-        sums = {path: sha256_packed(path, _zipped) for path in files if path is not None}
-        sums |= {path: sha256_of_recording(path) for path in depth - {Path(NONE)}}
-        return dataclasses.replace(self, imu=imu, sums=sums), log
+        files = {("attitude", self.attitude), *(("imu", g.file) for g in imu), *(("depth", path) for path in depth)}
+        there = [(prefix, path) for prefix, path in files if path is not None and str(path) != NONE]
+        room = new_folder() if any(path.is_dir() for _, path in there) else None
+        kept: dict[tuple[str, Path], Kept] = {}
+        read = dataclasses.replace(self, imu=imu, kept=kept, room=room)
+        try:
+            if self.depth is not None and ("depth", self.depth.file) in there:
+                check_recording(self.depth)
+            for prefix, path in there:
+                zip_of = pack if prefix == "depth" else _zipped
+                copy = zip_of(path, room.path / f"{prefix}{len(kept)}.zip") if room and path.is_dir() else path
+                kept[prefix, path] = Kept(copy, sha256_of(copy))
+        except OSError as error:
+            found, key = error.strerror or str(error), error.filename
+            next_step = "check the path, and that you may read the file"
+            raise store_full(error) or PblError("FILE_MISSING", found, "files to keep", next_step, key) from error
+        finally:
+            if len(kept) < len(there):
+                read.remove_copies()
+        return read, log
+
+    def remove_copies(self) -> None:
+        """Remove the zips of folders."""
+        if self.room is not None:
+            self.room.cleanup()
 
 
 def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
@@ -85,10 +115,10 @@ def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
     key = {"video_id": video_id}
     done = []
     if given.attitude is not None:
-        done += _attach_log(key, given.attitude, given.sums, log)
+        done += _attach_log(key, given.attitude, given.kept, log)
     if given.depth is not None:
-        done += _attach_depth(key, given.depth, given.sums)
-    return done + _attach_sensors(key, given.imu, given.sums)
+        done += _attach_depth(key, given.depth, given.kept)
+    return done + _attach_sensors(key, given.imu, given.kept)
 
 
 def attach_worn(session_id: int, given: Sequence[Given]) -> list[str]:
@@ -97,7 +127,11 @@ def attach_worn(session_id: int, given: Sequence[Given]) -> list[str]:
     videos = (video.Video & {"session_id": session_id}).to_arrays("video_id")
     if not len(videos):
         raise usage("sensors of a visit without a recording", "at least one recording", next_step="film first")
-    return attach_now(int(min(videos)), Sensors(imu=given).read()[0])
+    worn, _ = Sensors(imu=given).read()
+    try:
+        return attach_now(int(min(videos)), worn)
+    finally:
+        worn.remove_copies()
 
 
 def attach_now(video_id: int, worn: Sensors) -> list[str]:
@@ -108,7 +142,9 @@ def attach_now(video_id: int, worn: Sensors) -> list[str]:
     return done
 
 
-def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: PhoneLog | None) -> list[str]:
+def _attach_log(
+    key: dict[str, Any], path: Path, kept: Mapping[tuple[str, Path], Kept], log: PhoneLog | None
+) -> list[str]:
     table = video.PhoneAttitude & key
     if log is None:
         if not table:
@@ -125,7 +161,7 @@ def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: 
         "attitude_sensors": {name: len(s.time_s) for name, s in log.sensors.items()},
         "attitude_notes": list(log.notes),
     }
-    how = _keep(video.PhoneAttitude, "attitude", key, path, sums, about)
+    how = _keep(video.PhoneAttitude, "attitude", key, path, kept, about)
     if not how:
         return []
     return [
@@ -133,13 +169,11 @@ def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: 
     ]
 
 
-def _attach_depth(key: dict[str, Any], given: DepthFile, sums: Mapping[Path, str]) -> list[str]:
+def _attach_depth(key: dict[str, Any], given: DepthFile, kept: Mapping[tuple[str, Path], Kept]) -> list[str]:
     """Attach a depth recording to a video, or remove its older one, and delete the fits that were made otherwise."""
-    from pbl_pipeline.depth import pack
-
     table, removed = video.DepthVideo & key, str(given.file) == NONE
     before = [(r["depth_sha256"], bool(r["depth_read"]), number(r["depth_scale"])) for r in table.to_dicts()]
-    now = [] if removed else [(sums[given.file], given.known, given.scale_m)]
+    now = [] if removed else [(kept["depth", given.file].sha256, given.known, given.scale_m)]
     if before == now:
         return []
     session.lock(int((video.Video & key).fetch1("session_id")))  # no fit is inserted from here on
@@ -147,7 +181,7 @@ def _attach_depth(key: dict[str, Any], given: DepthFile, sums: Mapping[Path, str
     done = ["the depth recording was removed"]
     if not removed:
         about = {"depth_read": given.known, "depth_scale": given.scale_m}
-        _keep(video.DepthVideo, "depth", key, given.file, sums, about, pack)
+        _keep(video.DepthVideo, "depth", key, given.file, kept, about)
         how = "replaced" if before else "attached"
         done = [f"depth recording {given.file.name} was {how}" + ("" if given.known else _NOT_READ)]
     was_read = any(read for _, read, _ in before + now)
@@ -156,7 +190,7 @@ def _attach_depth(key: dict[str, Any], given: DepthFile, sums: Mapping[Path, str
     return done
 
 
-def _attach_sensors(key: dict[str, Any], given: Sequence[Given], sums: Mapping[Path, str]) -> list[str]:
+def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[tuple[str, Path], Kept]) -> list[str]:
     """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them. A log
     of a segment takes the place of the visit's older one. Raises what `fit.check_sensors` raises for all together."""
     if not given:
@@ -171,7 +205,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], sums: Mapping[P
     done, worn = [], False
     for (file, rate), own in files.items():
         rows = of_visit.to_dicts()
-        sha256 = None if str(file) == NONE else sums[file]
+        sha256 = None if str(file) == NONE else kept["imu", file].sha256
         if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
             before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
             own = {s: name for s, name in before.items() if name not in own.values()} | own
@@ -191,7 +225,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], sums: Mapping[P
             continue
         number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
         about = {"imu_segments": own or None, "imu_rate": rate}
-        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, sums, about)
+        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
         where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
         done.append(f"wearable IMU file {file.name} was attached, {where}")
         worn |= bool(own)
@@ -234,29 +268,27 @@ def _keep(
     prefix: str,
     key: dict[str, Any],
     path: Path,
-    sums: Mapping[Path, str],
+    kept: Mapping[tuple[str, Path], Kept],
     about: dict[str, Any] | None = None,
-    pack: Callable[[Path, Path], Path] | None = None,
 ) -> str:
-    """Insert a file, or a folder as the zip that `pack` writes, as the row with this key; return "attached", "replaced"
-    for an older one, or "" for the same bytes."""
+    """Insert a file, or the zip of a folder, as the row with this key; return "attached", "replaced" for an older one,
+    or "" for the same bytes."""
+    file, sha256 = kept[prefix, path]
     before = (table & key).to_dicts()
-    if before and before[0][f"{prefix}_sha256"] == sums[path]:
+    if before and before[0][f"{prefix}_sha256"] == sha256:
         return ""
-    with new_folder() as folder:
-        file = path if path.is_file() else (pack or _zipped)(path, folder / f"{prefix}.zip")
-        (table & key).delete(prompt=False)
-        table.insert1(
-            {
-                **key,
-                f"{prefix}_name": path.name[-255:],
-                f"{prefix}_sha256": sums[path],
-                f"{prefix}_size": file.stat().st_size,
-                f"{prefix}_created": utc_now(),
-                f"{prefix}_file": file,
-                **(about or {}),
-            }
-        )
+    (table & key).delete(prompt=False)
+    table.insert1(
+        {
+            **key,
+            f"{prefix}_name": path.name[-255:],
+            f"{prefix}_sha256": sha256,
+            f"{prefix}_size": file.stat().st_size,
+            f"{prefix}_created": utc_now(),
+            f"{prefix}_file": file,
+            **(about or {}),
+        }
+    )
     return "replaced" if before else "attached"
 
 
