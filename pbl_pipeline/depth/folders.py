@@ -97,7 +97,7 @@ def read_folder(
                     raise wrong(found, "pictures of one size, turned alike")
                 yield np.rot90(depth, -turn // 90) * scale_m, None if sure is None else np.rot90(sure, -turn // 90)
 
-    return Depth(called or folder, time_s, size_px, of_video, own, read)
+    return Depth(called or folder, time_s, size_px, of_video, own, read, turn_deg=turn)
 
 
 def _by_number(file: PurePosixPath) -> tuple[list[int], str]:

@@ -19,11 +19,12 @@ _SPREAD_M, _LEAST, _CONFIDENT, _NEAR = 0.05, 5, 1, 0.75
 
 @dataclasses.dataclass(frozen=True)
 class PointDepths:
-    """Depths at the keypoints of a trial, with the name and the SHA-256 of their recording."""
+    """Depths at the keypoints of a trial, with the name, the SHA-256 and the turn (deg) of their recording."""
 
     m: Float[np.ndarray, "T J 2"]  # of `at_points`
     name: str = ""
     sha256: str = ""
+    turn_deg: int = 0
 
 
 def at_points(depth: Depth, keypoints: Keypoints) -> PointDepths:
@@ -47,7 +48,7 @@ def at_points(depth: Depth, keypoints: Keypoints) -> PointDepths:
         middle = _middle(around)
         alike = np.sum(np.abs(around - middle[:, None]) <= _SPREAD_M / 2, axis=1) >= _LEAST
         out[t, known[t]] = np.stack([np.where(alike, middle, np.nan), _foremost(_around(pictures, at, 2))], axis=-1)
-    return PointDepths(out, depth.path.name, depth.sha256)
+    return PointDepths(out, depth.path.name, depth.sha256, depth.turn_deg)
 
 
 def _around(pictures: Pictures, at: np.ndarray, reach: int) -> np.ndarray:

@@ -38,7 +38,8 @@ class Depth:
     """A depth recording. `time_s` (N,): of its frames, 0 is the first; `size_px`: width and height of the video's
     pictures; `matrix` (3, 3) px: of those, `own_matrix`: of the depth pictures, None where the file does not state it
     and both show the same; `read`: raw depths (m, H x W) and confidences (H x W, 0 to 2, or None) of some frames;
-    `sha256`: of its file, or of a folder's zip."""
+    `sha256`: of its file, or of a folder's zip; `turn_deg`: clockwise turn that `read` and the matrices went through.
+    """
 
     path: Path
     time_s: np.ndarray
@@ -47,6 +48,7 @@ class Depth:
     own_matrix: np.ndarray | None
     read: Callable[[Iterable[int]], Iterator[Pictures]]
     sha256: str = ""
+    turn_deg: int = 0
 
     def camera(self, found: Camera) -> Camera:
         """The video's camera: that of the recording, unless the one that was found is calibrated or it states none.

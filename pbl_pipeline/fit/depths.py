@@ -34,6 +34,11 @@ MOST_OFF_M, LEAST_SHARE, LEAST_DEPTHS = 0.3, 0.5, 20
 FLOOR_SHARES = {"hip_flexion": 0.75, "knee_angle": 0.75}
 FLOOR_LEAST_USED = 0.3
 
+_AS_EXPORTED = (
+    "leave the pictures of Stray Scanner as exported: they are turned by 180 deg, as odometry.csv states; or leave "
+    "out the recording"
+)
+
 
 def check_depths(depths: Sequence[PointDepths | None], trials: Sequence[Any]) -> tuple[PointDepths | None, ...]:
     """The depths of some trials; empty where there are none. Raises `PblError` DEPTH_FILE: they are of other trials, of
@@ -84,10 +89,14 @@ def with_depths(
     wrong = (counts[:, 0] < LEAST_SHARE * counts[:, 1]) & (counts[:, 1] >= LEAST_DEPTHS)
     if wrong.any() or good.sum() < LEAST_DEPTHS:
         n, of = counts[wrong].sum(axis=0) if wrong.any() else counts.sum(axis=0)
+        turned = any(
+            d and d.turn_deg == 180 and (w or not wrong.any()) for d, w in zip(session.depths, wrong, strict=True)
+        )
         raise depth_error(
             said("{n} of {all} depths at the person's joints within 0.3 m of them", n=n, all=of),
             "most of them: a depth recording of this video, upright and not mirrored, within 5 m",
             key=", ".join(np.array(session.names)[wrong]),
+            **({"next_step": _AS_EXPORTED} if turned else {}),
         )
     share = np.array([n / of if of else np.nan for n, of in counts])
     sds = [next((sd for k, sd in SKIN_SD_M.items() if n.startswith(k)), OTHER_SD_M) for n in names]

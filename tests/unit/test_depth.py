@@ -321,6 +321,12 @@ def test_the_trial_with_a_wrong_recording_is_named():
     assert np.isnan(share[1])
     with pytest.raises(PblError, match=r"about: +b\n"):
         with_depths(dataclasses.replace(session, depths=(depth, away, depth)), *args)
+    # A recording that was turned, by hand before or not.
+    upside_down = [dataclasses.replace(d, turn_deg=180) for d in (depth, away)]
+    for own, turned in (((depth, upside_down[1], depth), True), ((upside_down[0], away, depth), False)):
+        with pytest.raises(PblError) as caught:
+            with_depths(dataclasses.replace(session, depths=own), *args)
+        assert ("turned by 180 deg" in caught.value.next_step) == turned
 
 
 def test_depths_of_other_trials_are_refused():
@@ -496,6 +502,7 @@ def test_pictures_of_a_turned_phone_are_turned_as_it_was_held(tmp_path: Path, tu
     (folder / "camera_matrix.csv").write_text("600.0, 0.0, 325.0\n0.0, 610.0, 236.0\n0.0, 0.0, 1.0\n")
     found = read_depth(folder, TIME_S, size)
     (depth, sure) = next(found.read([3]))
+    assert found.turn_deg == turn
     np.testing.assert_allclose(depth, upright[3], atol=1e-3)
     assert sure is not None
     assert sure.shape == depth.shape
