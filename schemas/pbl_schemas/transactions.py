@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import random
 import time
@@ -44,7 +45,7 @@ def _follow(call: Callable[[], object]) -> None:
     except Exception as error:
         raise PblError(
             "NOT_QUEUED",
-            found=said("it is stored, but what follows from it is not queued yet ({why})", why=str(error)),
+            found=said("it is stored, but what follows from it is not queued yet ({why})", why=type(error).__name__),
             expected="jobs for what is to be computed",
             next_step="do not send it again: workers look for it by themselves, within an hour at the latest",
         ) from error
@@ -68,8 +69,9 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
                 continue
             if not _inside():
                 calls, _waiting[:] = _waiting.copy(), []  # a call may be a transaction itself
-                for call in calls:
-                    _follow(call)
+                with contextlib.ExitStack() as all_of_them:
+                    for call in reversed(calls):
+                        all_of_them.callback(_follow, call)
             return done
         raise AssertionError("unreachable")
 

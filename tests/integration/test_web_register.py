@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import pymysql
 import pytest
 
 from pbl_pipeline import texts
@@ -15,9 +16,10 @@ from pbl_schemas.reading.shown import shown_visit
 from pbl_schemas.reading.visit_list import STATES, Filter, visit_page
 from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
+from pbl_workers import refresh
 from pbl_workers.populate import populate
 from pbl_workers.web import multipart
-from tests import Environment
+from tests import Environment, Faults
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -436,9 +438,13 @@ def test_a_wrong_statement_of_an_upload_takes_nothing(tmp_path: Path, archive: P
     assert not [p for p in archive.rglob("*") if p.is_file()]
 
 
-def test_a_good_file_beside_a_bad_one_is_taken(tmp_path: Path):
+@pytest.mark.parametrize("queued", [True, False])
+def test_a_good_file_beside_a_bad_one_is_taken(tmp_path: Path, faults: Faults, queued: bool):
+    """Also where only the queue fails: what is registered is found by the next look at all tables."""
     browser = web.client()
     new(browser)
+    if not queued:
+        faults(refresh, "refresh_scope", pymysql.err.OperationalError(1114, "The table is full"))
     answer = upload(browser, ("../../etc/passwd", b"x"), small_video(tmp_path, "walk", n=30), pace="slow")
     assert answer.status_code == 200
     assert "UPLOAD_REFUSED" in answer.text

@@ -12,7 +12,7 @@ from pbl_workers.process import DEVICE_FAILED, SELFTEST_FAILED, Options
 def work(options: Options, pipe: Connection) -> None:
     """Note the start in the folder `options.profile`; `full` and `wrong` end with an error, `idle` ends in order, any
     other waits to be told."""
-    (name,) = options.gpus
+    name = options.gpus[0] if options.gpus else "phones"
     with (Path(options.profile) / name).open("a", encoding="utf-8") as notes:
         notes.write(f"{os.getpid()}\n")
     code = {"full": DEVICE_FAILED, "wrong": SELFTEST_FAILED, "idle": 0}.get(name)

@@ -45,7 +45,7 @@ def test_a_change_is_judged_as_on_the_pages(visit):
     rows = {row["measure"]: row for row in visit_changes(now, before)}
     assert rows["gdi"]["change"] == 6.0
     assert (rows["gdi"]["least"], rows["gdi"]["verdict"]) == (5.5, "more than chance")
-    assert rows["gdi"]["real"] == pytest.approx(0.898, abs=0.001)
+    assert rows["gdi"]["real"] == pytest.approx(0.884, abs=0.001)
     assert (rows["cadence_steps_per_min"]["change"], rows["cadence_steps_per_min"]["real"]) == (0.0, None)
     less = {row["measure"]: row for row in visit_changes(with_index(now, mean=84.0), before)}
     assert less["gdi"]["verdict"] == "may be chance"

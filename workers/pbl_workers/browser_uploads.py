@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import logging
 import os
 import secrets
 from collections.abc import Sequence
@@ -19,6 +20,9 @@ from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
 from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, register_copies
+from .log import event
+
+log = logging.getLogger("pbl.web")
 
 _refused = functools.partial(PblError, "UPLOAD_REFUSED")
 
@@ -123,8 +127,8 @@ def register(
         visit = VisitRecord(to.subject, to.label, activity=activity or None, pace=pace or None)
         for one, copy in arrived:
             if not one.is_log:
-                log = logs.pop(PurePosixPath(one.name).stem, None)
-                out.append(_register_copies(visit, one.name, [copy, log] if log else [copy], by))
+                its_log = logs.pop(PurePosixPath(one.name).stem, None)
+                out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], by))
     alone = functools.partial(
         _refused,
         found="a sensor log alone",
@@ -134,7 +138,12 @@ def register(
     out += [Received(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
     if any(one.video_id is not None for one in out):
-        queue_visit(to.session_id)
+        try:
+            queue_visit(to.session_id)
+        except PblError as error:
+            if error.code != "NOT_QUEUED":  # workers find what is registered; the outcomes are not lost for it
+                raise
+            event(log, logging.ERROR, "not queued", error=error.text())
     return out
 
 

@@ -73,18 +73,25 @@ class _Child:
 
 @dataclasses.dataclass
 class _Place:
-    """Place of a working process. deaths: in a row, as `HOPELESS` counts them. until: end of its pause
-    (`time.monotonic`) while no process has it."""
+    """Place of a working process. deaths: in a row, as `HOPELESS` counts them. lived_s: the longest life of these.
+    until: end of its pause (`time.monotonic`) while no process has it."""
 
     name: str
     deaths: int = 0
+    lived_s: float = 0.0
     pause_s: float = 0.0
     until: float = 0.0
     why: str = ""
 
-    def rest(self, why: str, healthy: bool, over_job: bool) -> None:
+    def lives(self, lived_s: float) -> None:
+        """Forget deaths once a process lives longer than those before it."""
+        self.deaths *= lived_s < min(2 * self.lived_s, HEALTHY_S)
+
+    def rest(self, why: str, lived_s: float, over_job: bool) -> None:
         """Pause after a death."""
+        healthy = lived_s > HEALTHY_S
         self.deaths = 0 if healthy or over_job else self.deaths + 1
+        self.lived_s = max(self.lived_s, lived_s)
         shortest, longest = RESTART_S
         self.pause_s = shortest if healthy or not self.pause_s else min(2 * self.pause_s, longest)
         self.why, self.until = why, time.monotonic() + self.pause_s
@@ -220,9 +227,9 @@ class Supervisor:
         of its place."""
         code = 0
         for child in list(self._children):
-            place, healthy = self._place(child.number), time.monotonic() - child.started > HEALTHY_S
+            place, lived_s = self._place(child.number), time.monotonic() - child.started
             if child.process.is_alive():
-                place.deaths *= not healthy
+                place.lives(lived_s)
                 continue
             self._listen(0.0)  # its last messages
             child.process.join()
@@ -236,12 +243,14 @@ class Supervisor:
                 code = max(code, int(exit_code > 0 and exit_code != DEVICE_FAILED))
                 del self._places[child.number]
                 continue
-            place.rest(_death(exit_code), healthy, bool(child.jobs))
+            place.rest(_death(exit_code), lived_s, bool(child.jobs))
             if exit_code == SELFTEST_FAILED:
                 code, place.deaths, place.until = SELFTEST_FAILED, HOPELESS, math.inf
             event(log, logging.WARNING, "replaced later", about=str(place))
-        if self._places and not self._stopping and all(p.deaths >= HOPELESS for p in self._places.values()):
-            event(log, logging.CRITICAL, "giving up", why="; ".join(map(str, self._places.values())))
+        # The processes for phones and long recordings compute on no GPU and do not outlive the others.
+        main = [p for n, p in self._places.items() if n < self.options.processes]
+        if main and not self._stopping and all(p.deaths >= HOPELESS for p in main):
+            event(log, logging.CRITICAL, "giving up", why="; ".join(map(str, main)))
             self.stop()
             code = max(code, 1)
         self._wake()
