@@ -20,7 +20,7 @@ from .recording import depth_error
 _READ = re.compile(r"((depth|confidence)/)?[^/]+\.(png|npy)|(odometry|camera_matrix|depth_matrix)\.csv", re.IGNORECASE)
 #: Bytes of an archive's directory: 65,535 members, which is all that one can have.
 _DIRECTORY = 8 * bounded.MIB
-#: Bytes before each file in a zip, and its name.
+#: Bytes that a zip has before each file, beside its name.
 _HEADER = 30
 #: Function from a file's path in a folder or a zip, and its most bytes, to its content. It raises OSError, ValueError,
 #: KeyError and `bounded.DAMAGED`.

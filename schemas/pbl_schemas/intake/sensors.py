@@ -80,10 +80,10 @@ class Sensors:
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
         files = {("attitude", self.attitude), *(("imu", g.file) for g in imu), *(("depth", path) for path in depth)}
         there = [(prefix, path) for prefix, path in files if path is not None and str(path) != NONE]
-        room = new_folder() if any(path.is_dir() for _, path in there) else None
         kept: dict[tuple[str, Path], Kept] = {}
-        read = dataclasses.replace(self, imu=imu, kept=kept, room=room)
+        room = None
         try:
+            room = new_folder() if any(path.is_dir() for _, path in there) else None
             if self.depth is not None and ("depth", self.depth.file) in there:
                 check_recording(self.depth)
             for prefix, path in there:
@@ -95,9 +95,9 @@ class Sensors:
             next_step = "check the path, and that you may read the file"
             raise store_full(error) or PblError("FILE_MISSING", found, "files to keep", next_step, key) from error
         finally:
-            if len(kept) < len(there):
-                read.remove_copies()
-        return read, log
+            if room and len(kept) < len(there):
+                room.cleanup()
+        return dataclasses.replace(self, imu=imu, kept=kept, room=room), log
 
     def remove_copies(self) -> None:
         """Remove the zips of folders."""
