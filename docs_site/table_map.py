@@ -149,7 +149,7 @@ def _alone(cls: Any) -> str:
 
 
 def _prefix(cls: Any, word: str) -> str:
-    """What stands before the ending of each column of a table that has only those of a group."""
+    """Prefix of the columns of a table that has only those of a group."""
     return columns(cls)[0][0].removesuffix(_GROUPS[word][0])
 
 

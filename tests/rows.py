@@ -1,16 +1,21 @@
-"""The rows of a test's database: register videos, see every row, remove all that a test can have added."""
+"""The rows of a test's database: register videos, see every row, insert too late, remove all that a test can
+have added."""
 
 import os
 import shutil
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from pbl_pipeline import settings
-from pbl_schemas import connection
+from pbl_schemas import connection, fit
 from pbl_schemas.intake import Registered, VisitRecord, ingest
 from pbl_schemas.intake.records import session_ids
 from pbl_schemas.operations import backup_files, catalog
+from pbl_schemas.rows import InputChanged
 from pbl_schemas.transactions import in_transaction
 
 
@@ -141,3 +146,18 @@ def remove_copy(video_id: int) -> None:
             if "video_id" in [c.name for c in columns]:
                 cursor.execute(f"DELETE FROM {catalog.quote(*table)} WHERE video_id = {video_id}")
         server.commit()
+
+
+def late_fit(removed: Any, match: str) -> None:
+    """Compute the only fit again; its files in this table are removed before its insert, which is refused."""
+    table = fit.SessionFit()
+    key = table.fetch1("KEY")
+    result = table.make_compute(key, *table.make_fetch(key))
+    table.delete(prompt=False, part_integrity="cascade")
+    with table.connection.transaction:
+        with closing(connection.plain_connection()) as other:
+            other.cursor().execute(f"DELETE FROM {removed.full_table_name}")
+        assert len(removed()) == 1  # as this transaction sees it until its end
+        with connection.inserting(table), pytest.raises(InputChanged, match=match):
+            table.make_insert(key, *result)
+    assert len(table) == 0

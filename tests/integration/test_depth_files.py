@@ -4,7 +4,6 @@ import dataclasses
 import errno
 import os
 import tempfile
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,9 @@ from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import session_fit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.visit.files import visit_facts
-from pbl_schemas import connection, fit, load_visit, video
+from pbl_schemas import fit, load_visit, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest, registration
 from pbl_schemas.job_errors import stored_error
-from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
 from research.walker.depths import depth_recording
@@ -27,6 +25,7 @@ from tests import StandIn, not_none
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
+from tests.rows import late_fit
 from tests.unit.test_depth import write
 
 pytestmark = pytest.mark.usefixtures("tables")
@@ -167,16 +166,7 @@ def test_a_fit_without_the_depths_is_not_inserted_after_them(tmp_path: Path):
     path, folder = chain.small_video(tmp_path, "a"), chain.depth_pictures(tmp_path / "depth")
     ingested(path, "--depth", f"0.001={folder}")
     assert fitted()[0] == 3.0
-    table = fit.SessionFit()
-    key = table.fetch1("KEY")
-    result = table.make_compute(key, *table.make_fetch(key))
-    table.delete(prompt=False, part_integrity="cascade")
-    with table.connection.transaction:
-        with closing(connection.plain_connection()) as other:
-            other.cursor().execute(f"DELETE FROM {video.DepthVideo.full_table_name}")
-        assert len(video.DepthVideo()) == 1  # as this transaction sees it until its end
-        with connection.inserting(table), pytest.raises(InputChanged, match="depth recordings"):
-            table.make_insert(key, *result)
+    late_fit(video.DepthVideo, "depth recordings")
     assert fitted() == (1.0, [])
 
 
