@@ -5,6 +5,7 @@ which Firefox 153 does not have.
 """
 
 import contextlib
+import functools
 import itertools
 import json
 import re
@@ -89,7 +90,11 @@ class Firefox:
         send("browsingContext.setViewport", context=self._context, viewport=size)
 
     def goto(self, address: str) -> None:
-        self._send("browsingContext.navigate", context=self._context, url=address, wait="complete")
+        """Open a page, and the one to which its script may go at once: to wait for the first would then fail."""
+        self.evaluate("() => { globalThis.before = true; }")
+        self._send("browsingContext.navigate", context=self._context, url=address, wait="none")
+        there = "() => !globalThis.before && document.readyState === 'complete'"
+        until(functools.partial(self.evaluate, there), address)
 
     def evaluate(self, function: str, arg: Any = None) -> Any:
         told = self._send(
