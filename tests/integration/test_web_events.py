@@ -368,7 +368,7 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
         page.mouse.move(box["x"] + 13 + 18, box["y"] + 10, steps=4)
         page.mouse.up()
         frame = round((before.detected[6][0] + 0.2) * 30)
-        page.wait_for_selector(f"canvas.body[data-frame='{frame}']", timeout=120_000)  # the video is decoded in between
+        page.wait_for_selector(f"canvas.body[data-frame='{frame}']")
         # By the keyboard: two frames back; another is deleted, and one is added at the frame that is shown.
         page.keyboard.press("ArrowLeft")
         page.keyboard.press("ArrowLeft")

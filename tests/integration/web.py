@@ -109,6 +109,7 @@ def shown(
     with running(app, Where()) as port, contextlib.ExitStack() as stack:
         made = chromium.new_context(base_url=f"http://127.0.0.1:{port}", viewport=viewport, **context)
         stack.callback(made.close)
+        made.set_default_timeout(120_000)  # ms; on a busy machine videos are decoded slowly
         opened, errors = made.new_page(), []
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
