@@ -174,7 +174,7 @@ def _wanted(job: Claim) -> Any:
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
     if what == LATER and not isinstance(error, PblError):
-        error = of_database(error) or error  # what puts a job back is no fault of it
+        error = of_database(error) or error  # the job is not at fault
     coded = of_job(error, job.table.__name__, job.key)
     return Outcome(job, what, code=coded.code, text=coded.text())
 
