@@ -13,7 +13,7 @@ from pbl_pipeline.records import number
 
 from . import keypoints, session, video
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row
+from .method_rows import method_row, method_table
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, inside, one
 from .stored_files import file_ref, stored_file
@@ -48,13 +48,7 @@ class BodyModel(dj.Lookup):
     """
 
 
-@schema
-class FitMethod(dj.Lookup):
-    stage = "fit"
-    definition = f"""
-    # frozen parameters of a session fit
-    {method_columns("fit")}
-    """
+FitMethod = schema(method_table("FitMethod", "fit", "fit", "a session fit"))
 
 
 @schema

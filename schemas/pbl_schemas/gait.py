@@ -19,7 +19,7 @@ from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row
+from .method_rows import method_row, method_table
 from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .review import Decision
@@ -58,13 +58,7 @@ def mean_row(measures: Mapping[str, Measure | None], names: Iterable[str], prefi
     return {f"{prefix}{MEASURE_COLUMNS[n][0]}": None if (m := measures[n]) is None else number(m.mean) for n in names}
 
 
-@schema
-class GaitEventMethod(dj.Lookup):
-    stage = "gait"
-    definition = f"""
-    # frozen parameters of event detection
-    {method_columns("gait")}
-    """
+GaitEventMethod = schema(method_table("GaitEventMethod", "gait", "gait", "event detection"))
 
 
 @schema

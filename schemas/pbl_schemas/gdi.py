@@ -14,7 +14,7 @@ from pbl_pipeline.results.measures import Measure
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row, one_of, resolve_method
+from .method_rows import method_row, method_table, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .rows import InputChanged, Rows, one, row_of, stored_rows, utc_now
@@ -41,13 +41,7 @@ class NormativeSet(dj.Lookup):
     """
 
 
-@schema
-class GdiModel(dj.Lookup):
-    stage = "gdi"
-    definition = f"""
-    # frozen parameters of the index
-    {method_columns("gdi")}
-    """
+GdiModel = schema(method_table("GdiModel", "gdi", "gdi", "the index"))
 
 
 @schema

@@ -16,7 +16,7 @@ from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row
+from .method_rows import method_row, method_table
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import one
@@ -30,13 +30,7 @@ if TYPE_CHECKING:
 schema = dj.Schema()
 
 
-@schema
-class KeypointMethod(dj.Lookup):
-    stage = "keypoints"
-    definition = f"""
-    # frozen parameters of keypoint detection
-    {method_columns("keypoint")}
-    """
+KeypointMethod = schema(method_table("KeypointMethod", "keypoints", "keypoint", "keypoint detection"))
 
 
 @schema

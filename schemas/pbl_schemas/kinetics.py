@@ -15,7 +15,7 @@ from pbl_pipeline.temporary import new_folder
 
 from . import capture, fit, gait, gdi, session, study, video
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row
+from .method_rows import method_row, method_table
 from .origin import Origin, computes, origin_columns
 from .record_parts import measures_of, part_of
 from .rows import InputChanged
@@ -27,13 +27,7 @@ if TYPE_CHECKING:
 schema = dj.Schema()
 
 
-@schema
-class KineticsMethod(dj.Lookup):
-    stage = "kinetics"
-    definition = f"""
-    # frozen parameters of forces and joint moments
-    {method_columns("kinetics")}
-    """
+KineticsMethod = schema(method_table("KineticsMethod", "kinetics", "kinetics", "forces and joint moments"))
 
 
 @schema

@@ -12,6 +12,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.records import column, definition, from_row, record, to_row
 
+from .datajoint_setup import dj
 from .rows import one
 
 
@@ -31,6 +32,12 @@ def method_columns(prefix: str) -> str:
     {definition(_Row, prefix)}
     unique index ({prefix}_method_sha)
     """
+
+
+def method_table(name: str, stage: str, prefix: str, about: str) -> Any:
+    """Return the lookup table of the methods of a stage. `about`: what their frozen parameters are of."""
+    text = f"# frozen parameters of {about}{method_columns(prefix)}"
+    return type(dj.Lookup)(name, (dj.Lookup,), {"definition": text, "stage": stage})
 
 
 def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:

@@ -14,7 +14,7 @@ from pbl_pipeline.temporary import new_folder
 
 from . import video
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row
+from .method_rows import method_row, method_table
 from .origin import Origin, computes, origin_columns
 from .record_parts import part_of
 from .rows import delete_below, inside, one, utc_now
@@ -29,22 +29,12 @@ schema = dj.Schema()
 CHOSEN = ("CHOSEN", "MANUAL")
 
 
-@schema
-class TrackingMethod(dj.Lookup):
-    stage = "tracking"
-    definition = f"""
-    # frozen parameters of person detection, association and choice
-    {method_columns("tracking")}
-    """
-
-
-@schema
-class SubjectMethod(dj.Lookup):
-    stage = "subject"
-    definition = f"""
-    # frozen parameters of the automatic choice of the measured person
-    {method_columns("subject")}
-    """
+TrackingMethod = schema(
+    method_table("TrackingMethod", "tracking", "tracking", "person detection, association and choice")
+)
+SubjectMethod = schema(
+    method_table("SubjectMethod", "subject", "subject", "the automatic choice of the measured person")
+)
 
 
 @schema
