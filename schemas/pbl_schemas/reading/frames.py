@@ -10,6 +10,7 @@ from pymysql.converters import escape_string
 
 from pbl_pipeline.records import names
 from pbl_pipeline.results import Gdi
+from pbl_pipeline.results.fits import TrialFigures
 
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
@@ -21,16 +22,10 @@ if TYPE_CHECKING:
     from pbl_pipeline.validation import TrialErrors
 
 
+#: Measures whose mean stands in the row of a trial; of a visit after `session_`.
+_MEANS = [column for column, _ in gait.MEASURE_COLUMNS.values()][:6]
 _SESSION_COLUMNS = (
-    "session_status",
-    "session_reason",
-    "session_cycles",
-    "session_cadence",
-    "session_stride_time",
-    "session_step_time",
-    "session_stance",
-    "session_swing",
-    "session_double_support",
+    *("session_status", "session_reason", "session_cycles", *(f"session_{name}" for name in _MEANS)),
     *names(Gdi, "session_gdi", without=("status", "reason")),
 )
 
@@ -199,17 +194,10 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
 
 def trial_summary(restriction: Any = True) -> pd.DataFrame:
     """One row per fitted video: residuals, where the vertical comes from, events, measures and index of the trial."""
-    trials = fit.SessionFit.Trial.proj(
-        "trial_name",
-        "trial_n_fitted",
-        "trial_residual_2d",
-        "trial_residual_3d",
-        "trial_orientation",
-        "trial_clock_offset",
-    )
+    trials = fit.SessionFit.Trial.proj(*names(TrialFigures, "trial"))
     events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
     cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
-    measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
+    measures = gait.Spatiotemporal.proj(*_MEANS)
     index = gdi.GDI.proj(*names(Gdi, "gdi", without=("status", "reason")))
     joined = current_sets() * trials * events * cycles * measures * index
     return (joined & restriction).to_pandas(order_by="video_id").reset_index()
