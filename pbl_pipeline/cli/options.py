@@ -37,7 +37,8 @@ IMU = click.option(
     "--imu",
     multiple=True,
     metavar="[SEGMENT=]FILE",
-    help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit.",
+    help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit; "
+    "'none' for no sensors.",
 )
 DEPTH = click.option(
     "--depth",
@@ -80,17 +81,18 @@ def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     return logs
 
 
+def check_one_each(option: str, given: Sequence[object], n: int, next_step: str) -> None:
+    """Raise `PblError` USAGE unless an option is given for none of n videos, or for each."""
+    if given and len(given) != n:
+        found = f"{len(given)} times {option} for {n} videos"
+        raise PblError("USAGE", found, "none, or one for each video, in the same order", next_step)
+
+
 def depth_files(given: Sequence[str], n: int) -> list[DepthFile | None]:
     """Recordings of `--depth` for each of n videos. Raises `PblError` USAGE: another number of them."""
     from pbl_pipeline.depth import DepthFile
 
-    if given and len(given) != n:
-        raise PblError(
-            "USAGE",
-            found=f"{len(given)} times --depth for {n} videos",
-            expected="none, or one for each video, in the same order",
-            next_step="name a recording for each video, 'none' for one without",
-        )
+    check_one_each("--depth", given, n, "name a recording for each video, 'none' for one without")
     return [None if text == "none" else DepthFile.of(text) for text in given] or [None] * n
 
 

@@ -21,6 +21,7 @@ from .options import (
     MASS,
     PEOPLE,
     Person,
+    check_one_each,
     depth_files,
     fit_paramset,
     keypoint_method,
@@ -102,13 +103,8 @@ def run(
             next_step="leave out --person; if the automatic choice is wrong, run that video alone with --person, "
             "or use `pbl ingest` and `pbl choose`, which keep a choice for each video of a visit",
         )
-    if attitude and len(attitude) != len(videos):
-        raise PblError(
-            "USAGE",
-            found=f"{len(attitude)} times --attitude for {len(videos)} videos",
-            expected="none, or one for each video, in the same order",
-            next_step="name a log for each video; run videos without a log in another call",
-        )
+    next_step = "name a log for each video; run videos without a log in another call"
+    check_one_each("--attitude", attitude, len(videos), next_step)
     progress.note(f"{', '.join(p.name for p in videos)}: loading")
     from pbl_pipeline.change import earlier_visit
     from pbl_pipeline.files import check_out_folder

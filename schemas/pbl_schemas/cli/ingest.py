@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pbl_pipeline.cli.options import DEPTH, IMU, check_one_each
+
 if TYPE_CHECKING:
     from pbl_schemas.intake import Methods, Registered, Sensors, VisitRecord
 
@@ -79,19 +81,8 @@ _METHODS = ("tracking", "keypoint", "fit", "gdi", "norm", "kinetics")
     metavar="LOG",
     help="Sensor log of the phone (docs/phone_capture.md), once for each video, in their order; 'none' for no log.",
 )
-@click.option(
-    "--depth",
-    multiple=True,
-    metavar="[SCALE=]FILE",
-    help="Depth recording (docs/depth.md), once for each video, in their order; 'none' for no recording.",
-)
-@click.option(
-    "--imu",
-    multiple=True,
-    metavar="[SEGMENT=]FILE",
-    help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit; "
-    "'none' for no sensors.",
-)
+@DEPTH
+@IMU
 @click.option("--activity", help="What the person does, such as tug or sit_to_stand (else: walking).")
 @click.option(
     "--pace", help="How fast: self_selected, fast, slow, dual_task, ... (else: unknown, which counts as self_selected)."
@@ -283,12 +274,7 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[str, ...], imu: tupl
     from pbl_schemas.intake.sensors import NONE
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
-        if given and len(given) != n:
-            raise usage(
-                f"{len(given)} times {what} for {n} videos",
-                "none, or one for each video, in the same order",
-                next_step="name a file for each video, 'none' for one without",
-            )
+        check_one_each(what, given, n, "name a file for each video, 'none' for one without")
     worn = [sensor for text in imu for one in given_sensors(text) for sensor in named(one)]
     if n > 1 and (files := [one.file.name for one in worn if one.segment is None and str(one.file) != NONE]):
         alone = "name the segment, such as --imu shank_r=FILE, or ingest that video in a separate call"
