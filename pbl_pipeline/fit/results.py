@@ -6,12 +6,13 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.body import SCALE_NAMES, SLIDES
 from pbl_pipeline.bounded import parse_json
-from pbl_pipeline.errors import PblError, unread_file
+from pbl_pipeline.errors import unread_file
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import from_json, plain, record
@@ -109,24 +110,17 @@ class TrialFit:
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
-        fields = [*_ARRAYS, "camera_matrix", "distortion", "camera_source"]
         # Older files lack what could not be stated or was not kept then, others have no sensors or depths.
-        data = {
+        later: dict[str, Any] = {
             "height_m": np.asarray(np.nan),
             "confidence_curve": np.asarray(""),
             "with_depths": np.asarray(False),
             "sensors": np.asarray("[]"),
             "depth": np.asarray("null"),
-            **load_npz(path, [*fields, "sensors", "depth"]),
         }
-        missing = [k for k in fields if k not in data]
-        if missing:
-            raise PblError(
-                "FILE_FORMAT",
-                found=f"{path} lacks {', '.join(missing)}",
-                expected="a file that `pbl fit` wrote",
-                next_step="see docs/files.md, section fit.npz",
-            )
+        needed = [k for k in (*_ARRAYS, "camera_matrix", "distortion", "camera_source") if k not in later]
+        next_step = "see docs/files.md, section fit.npz"
+        data = later | load_npz(path, later, needed, next_step)
         check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
         values = {k: data[k] for k in _ARRAYS}
         try:
@@ -134,9 +128,7 @@ class TrialFit:
             depth = parse_json(text_of(path, data, "depth"))
             values["depth"] = None if depth is None else from_json(DepthFit, depth)
         except (ValueError, TypeError, AttributeError) as error:
-            raise unread_file(
-                error, "a file that `pbl fit` wrote", "see docs/files.md, section fit.npz", path
-            ) from error
+            raise unread_file(error, "a file that `pbl fit` wrote", next_step, path) from error
         for k in ("joint_names", "marker_names"):
             values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
