@@ -179,6 +179,36 @@ def test_a_stated_mounting(tmp_path: Path):
             assert f"a mounting of length {length}" in refused(given).found
 
 
+def test_a_mounting_stated_in_a_list(tmp_path: Path):
+    """Directions of two axes: the third follows; any other text is refused."""
+    worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    listed = tmp_path / "list.toml"
+    row = '[pelvis]\nfile = "MT_1-000_00B42D4B.txt"\nmount = "%s"\n'
+    for text, axes in (
+        ("x up, z back", [[0, 0, -1], [1, 0, 0], [0, -1, 0]]),
+        ("Y up X forward", np.eye(3)),
+        ("z right; y down", [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]),
+    ):
+        listed.write_text(row % text)
+        turn = Rotation.from_quat(not_none(read(listed)[0].mounting), scalar_first=True)
+        np.testing.assert_allclose(turn.as_matrix(), axes, atol=1e-9)
+    for text in (
+        "x up",
+        "x up x back",
+        "x up, y down",
+        "x up, z behind",
+        "x up, z back please",
+        "x up, y back, z right",
+    ):
+        listed.write_text(row % text)
+        with pytest.raises(PblError, match="a mount ") as wrong:
+            read(listed)
+        assert wrong.value.code == "USAGE"
+    sheet = tmp_path / "list.csv"
+    sheet.write_text('segment,file,mount\npelvis,MT_1-000_00B42D4B.txt,"x up, z back"\n')
+    assert given_sensors(str(sheet))[0].mount == "x up, z back"
+
+
 GYR, ACC, QUAT = (
     [f"gyr_{a}" for a in "xyz"],
     [f"acc_{a}" for a in "xyz"],
