@@ -171,7 +171,7 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
     shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
     thigh = worn_sensor.xsens(Swing(phase=1), tmp_path / "MT_1-000_00B42D4C.txt", rate=False)
-    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
+    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz,mount\nthigh_r,{thigh.name},100,x down z right\n")
     told = pbl("ingest", *videos, "--subject", "P001", "--imu", f"shank_r={shank}")
     assert told.code == 0, told.err
     assert "sensors on shank_r" in told.out
@@ -184,7 +184,12 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     assert "what was fitted without them was deleted: 1 of `pbl_fit`.`__session_fit`" in told.out
     _, logs, _ = fitted()
     assert {k: log.name for k, log in logs.items()} == {"shank_r": "00B42D4B", "thigh_r": "00B42D4C"}
+    assert (logs["shank_r"].mounting, not_none(logs["thigh_r"].mounting).shape) == (None, (4,))
     assert "nothing was inserted" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
+    # Another mounting of the same file, and none.
+    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
+    assert "deleted: 1 of" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
+    assert fitted()[1]["thigh_r"].mounting is None
     # A sensor was on the other side; a file with several sensors takes the place of one.
     assert "sensors on shank_l" in pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}").out
     assert set(fitted()[1]) == {"shank_l", "thigh_r"}
