@@ -164,7 +164,7 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
     """
     found = sensors_in(given)
     values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
-    measured = [b"".join(v.tobytes() for v in each if v is not None) for each in values]
+    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
     for i, (segment, samples, _) in enumerate(found):
         if segment in (s for s, _, _ in found[:i]) or (measured[i] and measured[i] in measured[:i]):
             raise PblError(

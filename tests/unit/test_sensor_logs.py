@@ -337,6 +337,9 @@ def test_a_sensor_or_a_segment_twice(tmp_path: Path):
     other = Swing(phase=1).write(tmp_path / "other.csv")
     assert "on shank_r: one of them twice" in refused(f"shank_r={path}", f"shank_r={other}").found
     assert "the sensor a on shank_l: one of them twice" in refused(f"shank_r={path}", f"shank_l={path}").found
+    dead = Swing().own().drop(columns=QUAT).assign(**dict.fromkeys(GYR + ACC, 0.0))
+    given = [f"shank_{side}={Swing().write(tmp_path / f'{side}.csv', dead)}" for side in "rl"]
+    assert "accelerations of typically 0" in refused(*given).found
     assert "a sensor on knee" in refused(f"knee={path}").found
     assert refused(path).code == "USAGE"  # no name that says a segment
     assert refused(f"shank_r={tmp_path / 'none.csv'}").code == "FILE_MISSING"
