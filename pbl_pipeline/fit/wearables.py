@@ -214,12 +214,10 @@ def _mount(seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation) 
         theirs = mount.apply(theirs)
         off = np.degrees(np.arccos(ours @ theirs / np.linalg.norm(ours) / np.linalg.norm(theirs)))
         if off > MOUNT_OFF_DEG:
+            about = said("a stated mounting that is {off:.0f} deg off gravity", off=off)
             raise input_error(
                 said(
-                    "sensor {name} on {segment}: a stated mounting that is {off:.0f} deg off gravity",
-                    name=sensor.log.name,
-                    segment=as_said(segment),
-                    off=off,
+                    "sensor {name} on {segment}: {found}", name=sensor.log.name, segment=as_said(segment), found=about
                 ),
                 "a mounting from the sensor's axes to the segment's (docs/imu.md)",
                 "correct it, or leave it out",
