@@ -84,7 +84,7 @@ def given_sensors(text: str, folder: Path = Path()) -> list[Given]:
     try:
         if path.suffix.lower() == ".toml":
             rows = [(k, v if isinstance(v, dict) else {"file": v}) for k, v in bounded.read_toml(path).items()]
-            return [_row(path, {"segment": k, **v}) for k, v in rows]
+            return _rows(path, [{"segment": k, **v} for k, v in rows])
         if path.suffix.lower() == ".xml":
             return _opensense(path)
         if path.suffix.lower() == ".csv" and b"segment" in bounded.read_start(path, 16):
@@ -93,7 +93,7 @@ def given_sensors(text: str, folder: Path = Path()) -> list[Given]:
             rows = list(csv.DictReader(io.StringIO(text), delimiter=separator, restkey="", restval=""))
             if any(any(row.pop("", ())) for row in rows):
                 raise ValueError("a row with more cells than names")
-            return [_row(path, {k.strip(): v.strip() for k, v in row.items()}) for row in rows]
+            return _rows(path, [{k.strip(): v.strip() for k, v in row.items()} for row in rows])
     except (OSError, ValueError, KeyError, TypeError, csv.Error, ElementTree.ParseError) as error:
         raise unread_file(error, "a list of sensors and their segments", "see docs/imu.md", path) from error
     return [Given(path)]
@@ -110,12 +110,20 @@ def _known(segment: str) -> str:
     return segment
 
 
-def _row(path: Path, row: dict[str, Any]) -> Given:
-    hz, mount = row.get("rate_hz") or None, row.get("mount") or None
-    if mount is not None:
-        mounting_of(mount)
-    segment, sensor = _known(row["segment"]), row.get("sensor") or None
-    return Given(path.parent / row["file"], segment, sensor, float(hz) if hz else None, mount=mount)
+def _rows(path: Path, rows: Sequence[dict[str, Any]]) -> list[Given]:
+    """The sensors that the rows of a list name. Raises `PblError` USAGE; KeyError, TypeError, ValueError."""
+    out = []
+    for row in rows:
+        if not row["file"]:
+            raise ValueError("a row without a file")
+        hz, mount = row.get("rate_hz") or None, str(row.get("mount") or "") or None
+        if mount is not None:
+            mounting_of(mount)
+        segment, sensor = _known(row["segment"]), row.get("sensor") or None
+        out.append(Given(path.parent / row["file"], segment, sensor, float(hz) if hz else None, mount=mount))
+    if not out:
+        raise ValueError("no sensors")
+    return out
 
 
 def mounting_of(mount: str) -> np.ndarray:

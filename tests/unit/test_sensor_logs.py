@@ -204,6 +204,9 @@ def test_a_mounting_stated_in_a_list(tmp_path: Path):
         with pytest.raises(PblError, match="a mount ") as wrong:
             read(listed)
         assert wrong.value.code == "USAGE"
+    listed.write_text('[pelvis]\nfile = "a.csv"\nmount = ["x up", "z back"]\n')
+    with pytest.raises(PblError, match="USAGE"):
+        read(listed)
     sheet = tmp_path / "list.csv"
     sheet.write_text('segment,file,mount\npelvis,MT_1-000_00B42D4B.txt,"x up, z back"\n')
     assert given_sensors(str(sheet))[0].mount == "x up, z back"
@@ -429,6 +432,21 @@ def test_lists_with_semicolons_and_with_an_empty_last_cell(tmp_path: Path):
     for text in ("segment;file\nshank_r;a.csv\n", "segment,file,sensor\nshank_r,a.csv,,\n"):
         path.write_text(text)
         assert given_sensors(str(path)) == [Given(tmp_path / "a.csv", "shank_r")]
+
+
+def test_a_list_that_names_no_file_is_refused(tmp_path: Path):
+    """A fit without sensors would be a silent one."""
+    for name, text, found in (
+        ("a.toml", "", "no sensors"),
+        ("a.csv", "segment,file\n", "no sensors"),
+        ("b.csv", "segment,file\nshank_r\n", "a row without a file"),
+        ("b.toml", 'shank_r = ""\n', "a row without a file"),
+        ("c.toml", "shank_r = 3\n", "TypeError"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(PblError, match=found) as wrong:
+            given_sensors(str(tmp_path / name))
+        assert wrong.value.code == "FILE_FORMAT"
 
 
 def test_no_sensors_on_the_command_line():
