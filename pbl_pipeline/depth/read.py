@@ -37,7 +37,7 @@ class DepthFile:
         """Return what `FILE` or `SCALE=FOLDER` on the command line, or in a sheet of `folder`, means."""
         scale, _, file = text.partition("=")
         with contextlib.suppress(ValueError):
-            if file and math.isfinite(number := float(scale)):
+            if file and math.isfinite(number := float(scale.replace(",", "."))):
                 return cls(folder / file, number)
         return cls(folder / text)
 

@@ -257,7 +257,10 @@ def test_depths_and_sensors_of_a_sheet(tables, recordings):
     said = re.findall(r"^([A-Z_]+): .*\n  about: +wrong\.csv, row (\d)", told.err, re.MULTILINE)
     assert said == [(code, str(n)) for n, code in enumerate(wrong.values(), 2)]
     assert len(video.Video()) == 0
-    rows = ["one.mp4,P001,1,0.001=depth,worn.csv", "two.mp4,P001,1,none,worn.csv", "three.mp4,P002,1,,none"]
+    rows = ["one.mp4,P001,1,,shank_r=apdm.csv", "two.mp4,P001,1,,thigh_r=apdm.csv"]
+    told = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="two.csv"))
+    assert (told.error_code, "imu shank_r=apdm.csv and thigh_r=apdm.csv" in told.err) == ("SHEET_CONFLICT", True)
+    rows = ['one.mp4,P001,1,"0,001=depth",worn.csv', "two.mp4,P001,1,none,worn.csv", "three.mp4,P002,1,,none"]
     path = sheet(recordings, *rows, header=header, name="beside.csv")
     for more, found in (("--dry-run",), 0), ((), 1):
         told = pbl("ingest", "--sheet", path, *more)

@@ -190,13 +190,18 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
     assert "deleted: 1 of" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
     assert fitted()[1]["thigh_r"].mounting is None
+    other = worn_sensor.xsens(Swing(phase=2), tmp_path / "MT_1-000_00B42D4D.txt")
+    told = pbl("ingest", videos[1], "--subject", "P001", "--imu", f"thigh_r={other}")
+    assert f"{other.name} was attached in place of {thigh.name}, sensors on thigh_r" in told.out
     # A sensor was on the other side; a file with several sensors takes the place of one.
-    assert "sensors on shank_l" in pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}").out
+    told = pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}")
+    assert f"{shank.name} was attached, sensors on shank_l" in told.out  # in place of no other file
     assert set(fitted()[1]) == {"shank_l", "thigh_r"}
     several = worn_sensor.apdm({"Left Ankle": Swing(phase=2), "Lumbar": Swing(phase=3)}, tmp_path / "apdm.csv")
     told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several, "--imu", "none")
     assert told.code == 0, told.err
-    pbl("ingest", videos[0], "--subject", "P001", "--imu", several)
+    told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several)
+    assert "sensors on pelvis, shank_l" in told.out
     assert set(fitted()[1]) == {"pelvis", "shank_l"}
     assert [r["imu_segments"] for r in video.WearableImu.to_dicts()] == [{"pelvis": "Lumbar", "shank_l": "Left Ankle"}]
     assert "were removed" in pbl("ingest", videos[0], "--subject", "P001", "--imu", "none").out

@@ -66,6 +66,7 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     _check_people(visits, lines)
     new: list[tuple[Row, Line, OneCamera]] = []
     seen: dict[str, str] = {}
+    worn: dict[tuple[str, str], str] = {}
     with ExitStack() as copies:
         for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
             if "file" not in row.cells:
@@ -82,6 +83,9 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
                     one.complete(chosen)
                     continue
                 _check_day(one, line)
+                if text := row.cells.get("imu"):
+                    key = visit.subject, visit.session_label
+                    check_same(worn.setdefault(key, text), text, "imu", ", ".join(key), "one list of all its sensors")
                 if known := registered(one.files):
                     _check_place(one, known)
                     line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"

@@ -207,10 +207,11 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         sha256 = None if str(file) == NONE else kept["imu", file].sha256
         if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
             before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
-            mounts |= {s: mount for s, mount in (same["imu_mounts"] or {}).items() if s not in own}
-            own = {s: name for s, name in before.items() if name not in own.values()} | own
+            others = {s: name for s, name in before.items() if s not in own and name not in own.values()}
+            own, mounts = others | own, {s: m for s, m in (same["imu_mounts"] or {}).items() if s in others} | mounts
             if (before, same["imu_rate"], same["imu_mounts"] or {}) == (own, rate, mounts):
                 continue
+        replaced = []
         for row in rows:
             this = {k: row[k] for k in video.WearableImu.primary_key}
             segments = row["imu_segments"] or {}
@@ -220,6 +221,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
             elif left != segments:
                 video.WearableImu.update1({**this, "imu_segments": left})
             worn |= left != segments or (sha256 is None and bool(segments))
+            replaced += [row["imu_name"]] if left != segments and row["imu_sha256"] != sha256 else []
         if sha256 is None:
             done += ["the wearable sensors were removed"] if rows else []
             continue
@@ -227,7 +229,8 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
         _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
         where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
-        done.append(f"wearable IMU file {file.name} was attached, {where}")
+        instead = f" in place of {', '.join(replaced)}" if replaced else ""
+        done.append(f"wearable IMU file {file.name} was attached{instead}, {where}")
         worn |= bool(own)
     if worn:
         done += fit.check_sensors(visit)
