@@ -202,10 +202,8 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
 def _mount(seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation) -> np.ndarray:
     """The rotation (3, 3) from a sensor to its segment: the stated one, or as they move. Raises `PblError` FIT_INPUT
     for a stated one that contradicts gravity."""
-    segment, reached = (
-        sensor.log.segment,
-        [(s, c) for s, c in zip(seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()],
-    )
+    segment = sensor.log.segment
+    reached = [(s, c) for s, c in zip(seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()]
     if sensor.log.mounting is None:
         return wahba([pair for s, c in reached for pair in vectors(s, c, sensor, segment)])
     mount = Rotation.from_quat(sensor.log.mounting, scalar_first=True)

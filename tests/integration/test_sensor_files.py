@@ -192,10 +192,10 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     assert fitted()[1]["thigh_r"].mounting is None
     other = worn_sensor.xsens(Swing(phase=2), tmp_path / "MT_1-000_00B42D4D.txt")
     told = pbl("ingest", videos[1], "--subject", "P001", "--imu", f"thigh_r={other}")
-    assert f"{other.name} was attached in place of {thigh.name}, sensors on thigh_r" in told.out
+    assert f"{other.name} was attached instead of {thigh.name}, sensors on thigh_r" in told.out
     # A sensor was on the other side; a file with several sensors takes the place of one.
     told = pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}")
-    assert f"{shank.name} was attached, sensors on shank_l" in told.out  # in place of no other file
+    assert f"{shank.name} was attached, sensors on shank_l" in told.out  # not instead of another file
     assert set(fitted()[1]) == {"shank_l", "thigh_r"}
     several = worn_sensor.apdm({"Left Ankle": Swing(phase=2), "Lumbar": Swing(phase=3)}, tmp_path / "apdm.csv")
     told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several, "--imu", "none")

@@ -229,7 +229,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
         _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
         where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
-        instead = f" in place of {', '.join(replaced)}" if replaced else ""
+        instead = f" instead of {', '.join(replaced)}" if replaced else ""
         done.append(f"wearable IMU file {file.name} was attached{instead}, {where}")
         worn |= bool(own)
     if worn:

@@ -136,8 +136,8 @@ async def taken_in(
     request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
 ) -> list[Received]:
     for _ in range(int(_WAIT_S) if good else 0):
-        texts = stated["activity"], stated["pace"], sender(request), stated["segment"]
-        done = await site.ask(request, browser_uploads.register, to, good, *texts)
+        said = stated["activity"], stated["pace"], sender(request), stated["segment"]
+        done = await site.ask(request, browser_uploads.register, to, good, *said)
         if done is not None:
             return done
         await asyncio.sleep(1.0)
