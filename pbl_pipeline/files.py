@@ -38,13 +38,18 @@ def sha256_of(path: str | Path) -> str:
 
 
 def zipped(folder: Path, copy: Path, names: Iterable[str], how: int = zipfile.ZIP_STORED) -> Path:
-    """Write files of a folder as a zip whose bytes depend on their names and contents only (packed: also on zlib)."""
-    with zipfile.ZipFile(copy, "w") as archive:
-        for name in sorted(names):
-            member = zipfile.ZipInfo(name)
-            member.compress_type = how
-            with (folder / name).open("rb") as source, archive.open(member, "w") as target:
-                shutil.copyfileobj(source, target)
+    """Write files of a folder as a zip whose bytes depend on their names and contents only (packed: also on zlib).
+    Raises OSError; `PblError` FILE_FORMAT for a name that is not UTF-8."""
+    try:
+        with zipfile.ZipFile(copy, "w") as archive:
+            for name in sorted(names):
+                member = zipfile.ZipInfo(name)
+                member.compress_type = how
+                with (folder / name).open("rb") as source, archive.open(member, "w") as target:
+                    shutil.copyfileobj(source, target)
+    except UnicodeEncodeError as error:
+        found = f"a file named {ascii(error.object)[:80]}"
+        raise PblError("FILE_FORMAT", found, "names of files in UTF-8", "rename it", folder) from error
     return copy
 
 

@@ -33,13 +33,13 @@ class DepthFile:
     called: str = ""
 
     @classmethod
-    def of(cls, text: str) -> DepthFile:
-        """Return what `FILE` or `SCALE=FOLDER` on the command line means."""
-        scale, _, folder = text.partition("=")
+    def of(cls, text: str, folder: Path = Path()) -> DepthFile:
+        """Return what `FILE` or `SCALE=FOLDER` on the command line, or in a sheet of `folder`, means."""
+        scale, _, file = text.partition("=")
         with contextlib.suppress(ValueError):
-            if folder and math.isfinite(number := float(scale)):
-                return cls(Path(folder), number)
-        return cls(Path(text))
+            if file and math.isfinite(number := float(scale.replace(",", "."))):
+                return cls(folder / file, number)
+        return cls(folder / text)
 
     @property
     def known(self) -> bool:

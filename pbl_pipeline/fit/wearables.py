@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import PblError, as_said, said
 from pbl_pipeline.results import SensorFit
 from pbl_pipeline.sensors.orientation import Orientation, input_error, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
-from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
+from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, verticals, wahba
 
 from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
@@ -34,6 +34,8 @@ MEMORY_S, SLIP_SD_RAD = 0.15, np.deg2rad(2.0)
 LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
 #: Standard deviation (deg, each axis) of a mounting that is stated.
 STATED_MOUNT_SD_DEG = 5.0
+#: Angle (deg) of a vertical by a stated mounting to the video's from which on the mounting is refused.
+MOUNT_OFF_DEG = 45.0
 #: Standard deviation (deg/s) of a gyroscope's bias, before and after a filter found it.
 BIAS_SD_DEG_S = 1.0, 0.4
 #: Change of velocity (m/s) by which the mean acceleration of a short log tilts the vertical.
@@ -198,11 +200,27 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
 
 
 def _mount(seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation) -> np.ndarray:
-    """The rotation (3, 3) from a sensor to its segment: the stated one, or as they move."""
-    if sensor.log.mounting is not None:
-        return Rotation.from_quat(sensor.log.mounting, scalar_first=True).as_matrix()
+    """The rotation (3, 3) from a sensor to its segment: the stated one, or as they move. Raises `PblError` FIT_INPUT
+    for a stated one that contradicts gravity."""
+    segment = sensor.log.segment
     reached = [(s, c) for s, c in zip(seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()]
-    return wahba([pair for s, c in reached for pair in vectors(s, c, sensor, sensor.log.segment)])
+    if sensor.log.mounting is None:
+        return wahba([pair for s, c in reached for pair in vectors(s, c, sensor, segment)])
+    mount = Rotation.from_quat(sensor.log.mounting, scalar_first=True)
+    for s, clock in reached:
+        ours, theirs = (v.mean(axis=0) for v in verticals(s, clock, sensor, segment))
+        theirs = mount.apply(theirs)
+        off = np.degrees(np.arccos(ours @ theirs / np.linalg.norm(ours) / np.linalg.norm(theirs)))
+        if off > MOUNT_OFF_DEG:
+            about = said("a stated mounting that is {off:.0f} deg off gravity", off=off)
+            raise input_error(
+                said(
+                    "sensor {name} on {segment}: {found}", name=sensor.log.name, segment=as_said(segment), found=about
+                ),
+                "a mounting from the sensor's axes to the segment's (docs/imu.md)",
+                "correct it, or leave it out",
+            )
+    return mount.as_matrix()
 
 
 def _heading(seen: Moved, clock: float, sensor: Orientation, mount: np.ndarray) -> np.ndarray:

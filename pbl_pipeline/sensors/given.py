@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError, said, unread_file
@@ -28,6 +29,12 @@ _WORDS = {
     "shank": "shank|tibia|lower ?leg|calf|ankle",
     "foot": "foot|calcn|instep",
 }
+#: Words for directions of a segment, along its axes forward, up and to the right.
+_DIRECTIONS = {
+    word: sign * np.eye(3)[axis]
+    for axis, words in enumerate((("forward", "back"), ("up", "down"), ("right", "left")))
+    for word, sign in zip(words, (1.0, -1.0), strict=True)
+}
 #: Sensors of one recording whose logs overlap by less than this share are not of one recording.
 _OVERLAP = 0.5
 
@@ -36,13 +43,14 @@ _OVERLAP = 0.5
 class Given:
     """A sensor that a person names. segment: None where the names of the sensors in the file say it; sensor: one of
     several in the file; rate_hz: samples a second, for a file that does not state them; called: name of the file of
-    which this one is a copy."""
+    which this one is a copy; mount: where two of its axes point, such as `x up, z back`."""
 
     file: Path
     segment: str | None = None
     sensor: str | None = None
     rate_hz: float | None = None
     called: str | None = None
+    mount: str | None = None
 
     @property
     def shown(self) -> Path:
@@ -60,23 +68,23 @@ def segment_of(name: str) -> str | None:
     return "pelvis" if found == ["pelvis"] else f"{found[0]}_{sides[0]}"
 
 
-def given_sensors(text: str) -> list[Given]:
-    """What `SEGMENT=FILE`, `SEGMENT=FILE#SENSOR` or `FILE` on the command line means.
+def given_sensors(text: str, folder: Path = Path()) -> list[Given]:
+    """What `SEGMENT=FILE`, `SEGMENT=FILE#SENSOR` or `FILE` on the command line, or in a sheet of `folder`, means.
 
     A file without a segment is a list of sensors (`.toml`; `.csv` with the columns segment, file; OpenSense's `.xml`)
     or a log whose sensors have the names of segments.
 
-    Raises `PblError` USAGE for another segment, FILE_MISSING, FILE_FORMAT for a list that cannot be read.
+    Raises `PblError` USAGE for another segment or mount, FILE_MISSING, FILE_FORMAT for a list that cannot be read.
     """
     segment, equals, rest = text.partition("=")
     if equals and "/" not in segment and "\\" not in segment:
-        file, _, sensor = rest.partition("#") if not Path(rest).exists() else (rest, "", "")
-        return [Given(Path(file), _known(segment), sensor or None)]
-    path = Path(text)
+        file, _, sensor = rest.partition("#") if not (folder / rest).exists() else (rest, "", "")
+        return [Given(folder / file, _known(segment), sensor or None)]
+    path = folder / text
     try:
         if path.suffix.lower() == ".toml":
             rows = [(k, v if isinstance(v, dict) else {"file": v}) for k, v in bounded.read_toml(path).items()]
-            return [_row(path, {"segment": k, **v}) for k, v in rows]
+            return _rows(path, [{"segment": k, **v} for k, v in rows])
         if path.suffix.lower() == ".xml":
             return _opensense(path)
         if path.suffix.lower() == ".csv" and b"segment" in bounded.read_start(path, 16):
@@ -85,7 +93,7 @@ def given_sensors(text: str) -> list[Given]:
             rows = list(csv.DictReader(io.StringIO(text), delimiter=separator, restkey="", restval=""))
             if any(any(row.pop("", ())) for row in rows):
                 raise ValueError("a row with more cells than names")
-            return [_row(path, {k.strip(): v.strip() for k, v in row.items()}) for row in rows]
+            return _rows(path, [{k.strip(): v.strip() for k, v in row.items()} for row in rows])
     except (OSError, ValueError, KeyError, TypeError, csv.Error, ElementTree.ParseError) as error:
         raise unread_file(error, "a list of sensors and their segments", "see docs/imu.md", path) from error
     return [Given(path)]
@@ -102,11 +110,38 @@ def _known(segment: str) -> str:
     return segment
 
 
-def _row(path: Path, row: dict[str, Any]) -> Given:
-    hz = row.get("rate_hz") or None
-    return Given(
-        path.parent / row["file"], _known(row["segment"]), row.get("sensor") or None, float(hz) if hz else None
-    )
+def _rows(path: Path, rows: Sequence[dict[str, Any]]) -> list[Given]:
+    """The sensors that the rows of a list name. Raises `PblError` USAGE; KeyError, TypeError, ValueError."""
+    out = []
+    for row in rows:
+        if not row["file"]:
+            raise ValueError("a row without a file")
+        hz, mount = row.get("rate_hz") or None, str(row.get("mount") or "") or None
+        if mount is not None:
+            mounting_of(mount)
+        segment, sensor = _known(row["segment"]), row.get("sensor") or None
+        out.append(Given(path.parent / row["file"], segment, sensor, float(hz) if hz else None, mount=mount))
+    if not out:
+        raise ValueError("no sensors")
+    return out
+
+
+def mounting_of(mount: str) -> np.ndarray:
+    """The rotation (quaternion, scalar first) from a sensor's axes to its segment's, by the directions of two of them:
+    `x up, z back`. Raises `PblError` USAGE."""
+    text = mount.lower()
+    found = dict(re.findall(r"\b([xyz])\s+([a-z]+)", text))
+    if re.sub(r"\b[xyz]\s+[a-z]+|[\s,;]", "", text) or len(found) != 2 or not set(found.values()) <= set(_DIRECTIONS):
+        found = {}
+    axes = np.zeros((3, 3))
+    for axis, word in found.items():
+        axes[:, "xyz".index(axis)] = _DIRECTIONS[word]
+    (third,) = np.flatnonzero(~axes.any(axis=0)) if found else (0,)
+    axes[:, third] = np.cross(axes[:, third - 2], axes[:, third - 1])
+    if abs(np.linalg.det(axes) - 1) > 0.01:
+        expected = said("where two of its axes point: x, y or z, and {words}", words=", ".join(_DIRECTIONS))
+        raise PblError("USAGE", said("a mount {text}", text=mount[:80]), expected, "such as: x up, z back")
+    return Rotation.from_matrix(axes).as_quat(scalar_first=True)
 
 
 def _opensense(path: Path) -> list[Given]:
@@ -137,7 +172,7 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
     """
     found = sensors_in(given)
     values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
-    measured = [b"".join(v.tobytes() for v in each if v is not None) for each in values]
+    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
     for i, (segment, samples, _) in enumerate(found):
         if segment in (s for s, _, _ in found[:i]) or (measured[i] and measured[i] in measured[:i]):
             raise PblError(
@@ -153,7 +188,7 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
             "sensors that were synchronised in one recording",
             key=found[0][2].shown,
         )
-    found = [(segment, _unwrapped(x, found[0][1]), g) for segment, x, g in found]
+    found = [(segment, _mounted(_unwrapped(x, found[0][1]), g), g) for segment, x, g in found]
     begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
     logs = tuple(checked(x, segment, w.shown, begin) for segment, x, w in found)
     first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
@@ -164,6 +199,10 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
             key=found[0][2].shown,
         )
     return logs
+
+
+def _mounted(samples: Samples, given: Given) -> Samples:
+    return samples if given.mount is None else dataclasses.replace(samples, mounting=mounting_of(given.mount))
 
 
 def _unwrapped(samples: Samples, first: Samples) -> Samples:

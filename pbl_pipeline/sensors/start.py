@@ -169,15 +169,19 @@ def wahba(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 def vectors(seen: Moved, clock: float, sensor: Orientation, segment: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """Pairs of vectors (T, 3) over their errors, in the axes of the segment and of the sensor: rates and verticals."""
     quat, known = sensor.at(seen.time + clock)
-    up = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]
-    pairs = [(seen.rate[segment], smooth(rate_of(quat)), RATE_SD), (seen.rotation[segment][:, 2], up, UP_SD)]
+    pairs = [(seen.rate[segment][known], smooth(rate_of(quat))[known], RATE_SD)]
+    pairs.append((*verticals(seen, clock, sensor, segment), UP_SD))
     heading = _heading(seen, sensor, seen.time + clock, known) if segment == "pelvis" else np.nan
     if np.isfinite(heading):
-        ahead = (Rotation.from_rotvec([0.0, 0.0, heading]) * Rotation.from_quat(quat, scalar_first=True)).as_matrix()[
-            :, 0
-        ]
-        pairs.append((seen.rotation[segment][:, 0], ahead, HEADING_SD))
-    return [(a[known] / sd, b[known] / sd) for a, b, sd in pairs]
+        turned = Rotation.from_rotvec([0.0, 0.0, heading]) * Rotation.from_quat(quat, scalar_first=True)
+        pairs.append((seen.rotation[segment][known, 0], turned.as_matrix()[known, 0], HEADING_SD))
+    return [(a / sd, b / sd) for a, b, sd in pairs]
+
+
+def verticals(seen: Moved, clock: float, sensor: Orientation, segment: str) -> tuple[np.ndarray, np.ndarray]:
+    """The vertical (T, 3) in the axes of the segment and of the sensor, where that was measured."""
+    quat, known = sensor.at(seen.time + clock)
+    return seen.rotation[segment][known, 2], Rotation.from_quat(quat, scalar_first=True).as_matrix()[known, 2]
 
 
 def _heading(seen: Moved, sensor: Orientation, time: np.ndarray, known: np.ndarray) -> float:

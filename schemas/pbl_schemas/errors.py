@@ -18,7 +18,7 @@ register(
         "DB_MIGRATION": Code(MACHINE, "the tables on the server are not as this version of the code declares them"),
         "INPUT_CHANGED": Code(MACHINE, "rows that a computation reads are gone, or changed each time it ran"),
         "NOT_QUEUED": Code(MACHINE, "it is stored, but what is to be computed then could not be queued yet"),
-        "STORE_UNAVAILABLE": Code(MACHINE, "the object store of the arrays cannot be reached, or refuses"),
+        "STORE_UNAVAILABLE": Code(MACHINE, "the store of the arrays cannot be reached, or refuses"),
         "STORE_FULL": Code(MACHINE, "the store of the arrays has no room left"),
         "BACKUP_INVALID": Code(INPUT, "a backup is incomplete or was changed"),
         "DECIDED_MEANWHILE": Code(CALL, "another person decided, or it was computed again, since the page was loaded"),

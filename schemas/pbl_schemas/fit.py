@@ -263,8 +263,8 @@ def _people(sets: Any) -> Any:
 
 
 def _beside(key: Mapping[str, Any], lock: str = "") -> tuple[tuple, tuple]:
-    """Recordings that a set is fitted with beside keypoints: bytes, segments and rates of the logs of wearable sensors,
-    none for markers; videos, bytes and scales of depth recordings, of one camera each. lock: clause by which a
+    """Recordings that a set is fitted with beside keypoints: bytes, segments, rates and mounts of the logs of wearable
+    sensors, none for markers; videos, bytes and scales of depth recordings, of one camera each. lock: clause by which a
     transaction sees what others have committed."""
     visit, kind = one(FitSet & {"fit_set": key["fit_set"]}, "session_id", "fit_set_kind")
     logs, depths = video.WearableImu.full_table_name, video.DepthVideo.full_table_name
@@ -274,7 +274,7 @@ def _beside(key: Mapping[str, Any], lock: str = "") -> tuple[tuple, tuple]:
         return tuple(FitSet.connection.query(f"{query} {lock}", args=(value,)).fetchall())
 
     worn = (
-        f"SELECT imu_sha256, imu_segments, imu_rate FROM {logs} JOIN {videos} USING (video_id)"  # noqa: S608
+        f"SELECT imu_sha256, imu_segments, imu_rate, imu_mounts FROM {logs} JOIN {videos} USING (video_id)"  # noqa: S608
         " WHERE session_id = %s AND imu_segments IS NOT NULL ORDER BY imu_sha256"
     )
     seen = (
@@ -291,12 +291,15 @@ def _depths(rows: Sequence[tuple]) -> dict[int, tuple]:
 
 
 def _worn(session_id: int, names: Mapping[int, str]) -> tuple[list[tuple], dict[str, str | None]]:
-    """Logs of wearable sensors of a visit, (file, its name, segments, rate) of each, and the time of recording of
-    some of its videos by their names."""
+    """Logs of wearable sensors of a visit, (file, its name, segments, rate, mounts) of each, and the time of recording
+    of some of its videos by their names."""
     of_visit = video.Video & {"session_id": session_id}
     rows = (video.WearableImu & of_visit.proj()).to_dicts(order_by=("video_id", "imu"))
     worn = [r for r in rows if r["imu_segments"]]
-    files = [(file_ref(r["imu_file"]), r["imu_name"], dict(r["imu_segments"]), number(r["imu_rate"])) for r in worn]
+    files = [
+        (file_ref(r["imu_file"]), r["imu_name"], dict(r["imu_segments"]), number(r["imu_rate"]), r["imu_mounts"] or {})
+        for r in worn
+    ]
     recorded = (video.VideoInfo & inside("video_id", names)).proj("recorded_utc").to_dicts()
     return files, {names[int(r["video_id"])]: r["recorded_utc"] for r in recorded}
 
@@ -309,8 +312,8 @@ def _read_worn(files: Sequence[tuple], recorded: Mapping[str, str | None]) -> tu
         paths = [stack.enter_context(stored_file(ref)) for ref, *_ in files]
         sensors = read_given(
             [
-                Given(path, segment, sensor or None, rate, called)
-                for path, (_, called, segments, rate) in zip(paths, files, strict=True)
+                Given(path, segment, sensor or None, rate, called, mounts.get(segment))
+                for path, (_, called, segments, rate, mounts) in zip(paths, files, strict=True)
                 for segment, sensor in sorted(segments.items())
             ]
         )

@@ -21,6 +21,8 @@ from .operations.folders import private_folder, secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
 LOCATION = "arrays"
+#: Packages whose errors are those of an object store, beside OSError.
+CLIENTS = ("botocore", "aiobotocore", "aiohttp")
 
 
 def is_remote() -> bool:
@@ -181,6 +183,13 @@ def store_errors() -> Iterator[None]:
         raise store_error(error) from error
 
 
+def unkept(error: OSError) -> PblError:
+    """Return the coded error for a file that could not be read to be kept, or of which no copy could be written."""
+    next_step = "check the path, and that you may read the file"
+    missing = PblError("FILE_MISSING", error.strerror or str(error), "files to keep", next_step, error.filename)
+    return store_full(error) or missing
+
+
 def store_error(error: BaseException) -> PblError:
     """Return the coded error for an error of the store. The clients' messages hold no secret."""
     if (full := store_full(error)) is not None:
@@ -189,8 +198,10 @@ def store_error(error: BaseException) -> PblError:
         "STORE_UNAVAILABLE",
         key=describe(),
         found=f"{type(error).__name__}: {error}"[:500],
-        expected="an object store that keeps what is written to it",
-        next_step="see that it runs and has space, and that PBL_S3_* name it, its bucket and a key that may write",
+        expected="a store that keeps what is written to it",
+        next_step="see that it runs and has space, and that PBL_S3_* name it, its bucket and a key that may write"
+        if is_remote()
+        else "see that its disk is there and works, and that you may write to the folder (PBL_STORE)",
     )
 
 

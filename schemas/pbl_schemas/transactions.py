@@ -8,14 +8,17 @@ import random
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import pymysql
 
+from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError, said
 
 from . import lab
 from .datajoint_setup import REPEAT, DuplicateError, dj
+from .store import CLIENTS, store_error, unkept
 
 T = TypeVar("T")
 Arguments = ParamSpec("Arguments")
@@ -104,6 +107,19 @@ def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: Fa
             if until() or attempt == _ATTEMPTS - 1:
                 raise
     raise AssertionError("unreachable")
+
+
+def keep_files(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
+    """Run `work`, which puts files into the store, as `in_transaction` that is `fresh`. Raises `PblError` FILE_MISSING
+    for one of these files, else STORE_FULL, STORE_UNAVAILABLE; errors of the database as they are."""
+    try:
+        return in_transaction(work, until, fresh=True)
+    except Exception as error:
+        if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in CLIENTS:
+            raise
+        file = Path(getattr(error, "filename", None) or settings.store_dir())
+        in_store = not file.is_absolute() or file.is_relative_to(settings.store_dir())
+        raise store_error(error) if in_store or not isinstance(error, OSError) else unkept(error) from error
 
 
 def next_id(table: Any, attribute: str, n: int = 1) -> int:

@@ -150,6 +150,7 @@ class WearableImu(dj.Manual):
     imu_name          : varchar(255)           # name of the file
     imu_segments=null : json                   # segment of the body, such as shank_r, to the name of its sensor in the file; null: kept, not read
     imu_rate=null     : float64                # (1/s) samples a second, as a person stated; null: the file says it
+    imu_mounts=null   : json                   # segment to where two axes of its sensor point, such as x up, z back, as a person stated; null: none
     imu_sha256        : char(64)               # of its bytes
     imu_size          : int64                  # (byte) length
     imu_created       : datetime               # when registered, UTC

@@ -168,6 +168,11 @@ def undo_0015(cursor: Any) -> None:
     cursor.execute("ALTER TABLE pbl_worker.worker DROP COLUMN worker_gpus")
 
 
+def undo_0017(cursor: Any) -> None:
+    """Forget how wearable sensors sit."""
+    cursor.execute("ALTER TABLE pbl_video.wearable_imu DROP COLUMN imu_mounts")
+
+
 def undo_0016(cursor: Any) -> None:
     """Narrow the columns of reasons."""
     before = {"cycle_lengths_missing": 150, "curves_missing": 100, "forces_missing": 100}

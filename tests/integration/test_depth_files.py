@@ -99,13 +99,13 @@ def test_a_recording_that_cannot_be_read_deletes_nothing(tmp_path: Path):
 def test_a_folder_is_packed_once_and_outside_the_transaction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What is stored has the hash of its row, also where the folder changes meanwhile."""
     path, folder = chain.small_video(tmp_path, "a"), chain.depth_pictures(tmp_path / "depth")
-    sha256, work = sha256_of_recording(folder), registration.in_transaction
+    sha256, work = sha256_of_recording(folder), registration.keep_files
 
     def changed(*args, **named):
         (folder / "0.png").write_bytes(b"other pictures")
         return work(*args, **named)
 
-    monkeypatch.setattr(registration, "in_transaction", changed)
+    monkeypatch.setattr(registration, "keep_files", changed)
     ingested(path, "--depth", f"0.001={folder}")
     assert sha256_of_recording(folder) != sha256
     row = video.DepthVideo.fetch1()

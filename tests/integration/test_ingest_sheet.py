@@ -1,18 +1,23 @@
 """`pbl ingest --sheet`: every row or none, and what is refused."""
 
 import datetime
+import os
 import re
+import tempfile
 from pathlib import Path
 
 import av
+import pymysql
 import pytest
 
 from pbl_schemas import lab, session, video
 from pbl_schemas.intake import videos
 from pbl_schemas.intake.recording_sheet import COLUMNS, ingest_sheet
 from pbl_schemas.intake.sheets import read_sheets
+from tests import worn_sensor
 from tests.command import pbl
 from tests.rows import everything
+from tests.worn_sensor import Swing
 
 from . import chain
 
@@ -210,8 +215,8 @@ def test_other_columns_are_refused_whole(tables, recordings):
 
 
 def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, faults):
-    faults(videos.OneCamera, "insert", None, None, OSError("the connection is gone"))
-    with pytest.raises(OSError, match="gone"):
+    faults(videos.OneCamera, "insert", None, None, pymysql.err.OperationalError(2013, "the connection is gone"))
+    with pytest.raises(pymysql.err.OperationalError, match="gone"):
         ingest_sheet(sheet(recordings, *GOOD))
     assert (len(video.Video()), len(session.Session()), len(lab.Subject())) == (0, 0, 0)
 
@@ -229,3 +234,41 @@ def test_a_recording_of_another_visit_or_person_is_named_with_the_way_out(tables
         done = pbl("ingest", "--sheet", sheet(recordings, row, header="file,subject,visit", name="other.csv"))
         assert done.error_code == code, done.err
         assert "pbl move" in done.err
+
+
+def test_depths_and_sensors_of_a_sheet(tables, recordings):
+    """Paths are relative to the sheet; a visit's sensors may stand in each of its rows; nothing is left over."""
+    chain.depth_pictures(recordings / "depth")
+    several = {"Right Ankle": Swing(), "Right Thigh": Swing(phase=1)}
+    worn_sensor.apdm(several, recordings / "apdm.csv")
+    (recordings / "worn.csv").write_text("segment,file\nshank_r,apdm.csv\nthigh_r,apdm.csv\n")
+    header = "file,subject,visit,depth,imu"
+    wrong = {
+        "1e-3=no": "FILE_MISSING",
+        "1e-3=worn.csv": "DEPTH_FILE",
+        "depth": "DEPTH_FILE",
+        ",foot=apdm.csv": "USAGE",
+        ",foot_r=no.csv": "FILE_MISSING",
+        ",foot_r=apdm.csv": "USAGE",
+    }
+    rows = [f"one.mp4,P001,1,{cells}" for cells in wrong]
+    told = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="wrong.csv"))
+    assert told.code == 1
+    said = re.findall(r"^([A-Z_]+): .*\n  about: +wrong\.csv, row (\d)", told.err, re.MULTILINE)
+    assert said == [(code, str(n)) for n, code in enumerate(wrong.values(), 2)]
+    assert len(video.Video()) == 0
+    rows = ["one.mp4,P001,1,,shank_r=apdm.csv", "two.mp4,P001,1,,thigh_r=apdm.csv"]
+    told = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="two.csv"))
+    assert (told.error_code, "imu shank_r=apdm.csv and thigh_r=apdm.csv" in told.err) == ("SHEET_CONFLICT", True)
+    rows = ['one.mp4,P001,1,"0,001=depth",worn.csv', "two.mp4,P001,1,none,worn.csv", "three.mp4,P002,1,,none"]
+    path = sheet(recordings, *rows, header=header, name="beside.csv")
+    for more, found in (("--dry-run",), 0), ((), 1):
+        told = pbl("ingest", "--sheet", path, *more)
+        assert told.code == 0, told.err
+        assert len(video.DepthVideo()) == len(video.WearableImu()) == found
+    assert "depth recording depth was attached" in told.out
+    row = video.DepthVideo.fetch1()
+    assert (row["video_id"], row["depth_name"], row["depth_scale"]) == (1, "depth", 0.001)
+    row = video.WearableImu.fetch1()
+    assert (row["video_id"], row["imu_segments"]) == (1, {"shank_r": "Right Ankle", "thigh_r": "Right Thigh"})
+    assert not list(Path(tempfile.gettempdir()).glob(f"pbl-tmp-{os.getpid()}-*/*.zip"))

@@ -179,6 +179,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     rows = everything()
     _undo(
+        older_tables.undo_0017,
         older_tables.undo_0016,
         older_tables.undo_0015,
         older_tables.undo_0014,
@@ -388,7 +389,7 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert {"gdi_unshrunk", "gdi_unshrunk_sd"} < set(gdi.GDI.heading.names)
     assert {"session_gdi_unshrunk", "session_gdi_unshrunk_sd"} < set(gdi.SessionGdi.heading.names)
     assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
-    assert {"imu_segments", "imu_rate"} < set(video.WearableImu.heading.names)
+    assert {"imu_segments", "imu_rate", "imu_mounts"} < set(video.WearableImu.heading.names)
     assert {"depth_read", "depth_scale"} < set(video.DepthVideo.heading.names)
     assert "worker_gpus" in worker.Worker.heading.names
     assert "varchar(1000)" in gait.Spatiotemporal.Measure.heading["measure_missing"].original_type

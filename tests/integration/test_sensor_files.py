@@ -1,11 +1,15 @@
 """Files that come with a video, in the tables: the phone's log reaches keypoints and fit, the others are kept."""
 
 import dataclasses
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from datajoint.storage import StorageBackend
 
+from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
@@ -16,7 +20,7 @@ from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
-from tests import StandIn, not_none, worn_sensor
+from tests import Faults, StandIn, not_none, worn_sensor
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
@@ -167,7 +171,7 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
     shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
     thigh = worn_sensor.xsens(Swing(phase=1), tmp_path / "MT_1-000_00B42D4C.txt", rate=False)
-    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
+    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz,mount\nthigh_r,{thigh.name},100,x down z right\n")
     told = pbl("ingest", *videos, "--subject", "P001", "--imu", f"shank_r={shank}")
     assert told.code == 0, told.err
     assert "sensors on shank_r" in told.out
@@ -180,14 +184,24 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     assert "what was fitted without them was deleted: 1 of `pbl_fit`.`__session_fit`" in told.out
     _, logs, _ = fitted()
     assert {k: log.name for k, log in logs.items()} == {"shank_r": "00B42D4B", "thigh_r": "00B42D4C"}
+    assert (logs["shank_r"].mounting, not_none(logs["thigh_r"].mounting).shape) == (None, (4,))
     assert "nothing was inserted" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
+    # Another mounting of the same file, and none.
+    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
+    assert "deleted: 1 of" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
+    assert fitted()[1]["thigh_r"].mounting is None
+    other = worn_sensor.xsens(Swing(phase=2), tmp_path / "MT_1-000_00B42D4D.txt")
+    told = pbl("ingest", videos[1], "--subject", "P001", "--imu", f"thigh_r={other}")
+    assert f"{other.name} was attached instead of {thigh.name}, sensors on thigh_r" in told.out
     # A sensor was on the other side; a file with several sensors takes the place of one.
-    assert "sensors on shank_l" in pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}").out
+    told = pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}")
+    assert f"{shank.name} was attached, sensors on shank_l" in told.out  # not instead of another file
     assert set(fitted()[1]) == {"shank_l", "thigh_r"}
     several = worn_sensor.apdm({"Left Ankle": Swing(phase=2), "Lumbar": Swing(phase=3)}, tmp_path / "apdm.csv")
     told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several, "--imu", "none")
     assert told.code == 0, told.err
-    pbl("ingest", videos[0], "--subject", "P001", "--imu", several)
+    told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several)
+    assert "sensors on pelvis, shank_l" in told.out
     assert set(fitted()[1]) == {"pelvis", "shank_l"}
     assert [r["imu_segments"] for r in video.WearableImu.to_dicts()] == [{"pelvis": "Lumbar", "shank_l": "Left Ankle"}]
     assert "were removed" in pbl("ingest", videos[0], "--subject", "P001", "--imu", "none").out
@@ -336,3 +350,47 @@ def test_the_uncertainty_of_a_calibration_is_stored(tmp_path: Path):
     # The same file again is the same calibration.
     assert outcomes(ingest([path], VisitRecord("P001", camera_file=camera))) == ["known"]
     assert len(lab.CameraCalibration()) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "STORE_FULL"),
+        (OSError(errno.EIO, "Input/output error"), "STORE_UNAVAILABLE"),
+        (PermissionError(errno.EACCES, "Permission denied", "in the store"), "STORE_UNAVAILABLE"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "/tmp/shank.csv"), "FILE_MISSING"),
+        (type("EndpointConnectionError", (Exception,), {"__module__": "botocore.exceptions"})(), "STORE_UNAVAILABLE"),
+    ],
+)
+def test_a_store_that_takes_no_copy_is_named(tmp_path: Path, faults: Faults, error: Exception, code: str):
+    """Of one that registers and of one that adds to a video; the other recordings are registered."""
+    if isinstance(error, PermissionError):
+        error.filename = str(settings.store_dir() / "pbl_video")
+    one, two = (chain.small_video(tmp_path, name) for name in ("a", "b"))
+    given = f"shank_r={worn_sensor.xsens(Swing(), tmp_path / 'MT_1-000_00B42D4B.txt')}"
+    with faults(StorageBackend, "put_buffer", error):
+        told = pbl("ingest", one, two, "--subject", "P001", "--imu", given)
+    assert (told.code, told.error_code) == (1, code)
+    assert [str(name) for name in video.Video.to_arrays("video_name")] == ["b.mp4"]
+    with faults(StorageBackend, "put_buffer", error):
+        assert pbl("ingest", two, "--subject", "P001", "--imu", given).error_code == code
+    assert len(video.WearableImu()) == 0
+    assert "was attached" in pbl("ingest", two, "--subject", "P001", "--imu", given).out
+
+
+def test_names_that_are_not_utf8_have_a_code(tmp_path: Path):
+    path, odd = chain.small_video(tmp_path, "a"), os.fsdecode(b"odd\xff")
+    depth = chain.depth_pictures(tmp_path / "depth")
+    (depth / "3.png").rename(depth / f"3{odd}.png")
+    shank = Swing().write(tmp_path / f"{odd}.csv")
+    log = sensor_logger(tmp_path / "log", 12.0)
+    (log / f"{odd}.csv").write_text("")
+    for option, given, code in (
+        ("--depth", f"0.001={depth}", "FILE_FORMAT"),
+        ("--attitude", log, "FILE_FORMAT"),
+        ("--imu", f"shank_r={shank}", "USAGE"),
+    ):
+        told = pbl("ingest", path, "--subject", "P001", option, given)
+        assert (told.code, told.error_code) == (1, code)
+        assert "\\udcff" in told.err
+    assert len(video.Video()) == 0

@@ -453,8 +453,13 @@ def test_sensors_on_takes_their_log_after_filming(camera: Any, visit: int, tmp_p
         page.locator(".worn li", has_text="without a recording").wait_for()
         film(page, 1.0)
         keep(page)
+        missing = page.get_by_text("none of their logs has arrived")
+        missing.wait_for()
+        assert phone_recordings.filming(visit)["log_missing"]
         log.set_input_files(shank)
         page.locator(".worn li", has_text="right shank").wait_for()
+        missing.wait_for(state="detached")
+    assert not phone_recordings.filming(visit)["log_missing"]
     row = video.WearableImu.fetch1()
     assert (row["imu_name"], row["imu_segments"]) == ("shank.csv", {"shank_r": "shank"})
     assert about_the_recording()["worn"] == "on"

@@ -23,6 +23,7 @@ from tests import Environment, Faults
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
+from tests.worn_sensor import Swing
 
 VISIT = {"subject": "P001", "visit": "2026-01-10"}
 
@@ -506,3 +507,29 @@ def test_each_form_is_also_json():
     assert set(browser.get("/visits/new.json").json()["values"]) == {*NEW, "height_m", "distinct"}
     assert set(FACTS) <= set(browser.get("/visits/1/facts.json").json()["values"])
     assert browser.get("/visits/1/upload.json").json()["to"]["subject"] == "P001"
+
+
+def test_logs_of_wearable_sensors_go_with_the_visit(tmp_path: Path, archive: Path):
+    """A log that cannot be taken is named with its own words, beside one that is; all are of one visit."""
+    browser, names = web.client(name="A. First"), ("right shank.csv", "none.csv")
+    new(browser)
+    shank, none = (tmp_path / name for name in names)
+    Swing().write(shank)
+    none.write_text("frame,x\n1,2\n")
+
+    def send(*files: Path, segment: str = "shank_r"):
+        fields = {"token": web.token(browser), "segment": segment}
+        parts = [("worn", (f.name, f.read_bytes())) for f in files]
+        return browser.post("/visits/1/upload", data=fields, files=parts, follow_redirects=False)
+
+    assert "without a recording" in send(shank).text
+    assert upload(browser, small_video(tmp_path, "walk")).status_code == 303
+    page = send(none, shank).text
+    assert "no known format" in page
+    assert "Choose at least one video" not in page
+    assert f"{shank.name}: registered" in page
+    assert send(shank, segment="thigh_l").status_code == 303
+    (row,) = video.WearableImu.to_dicts()
+    assert (row["imu_name"], row["imu_segments"]) == (shank.name, {"thigh_l": "right shank"})
+    assert send(shank, segment="knee").status_code == 415
+    assert not list(archive.rglob("browser-*"))

@@ -47,6 +47,7 @@ def build(folder: Path) -> None:
         _populate()
         review_decisions.mark_not_usable(third, "camera_moved", by="B. Second")
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        older_tables.undo_0017(cursor)
         older_tables.undo_0016(cursor)
         older_tables.undo_0015(cursor)
         older_tables.undo_0014(cursor)

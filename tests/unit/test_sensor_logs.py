@@ -179,6 +179,39 @@ def test_a_stated_mounting(tmp_path: Path):
             assert f"a mounting of length {length}" in refused(given).found
 
 
+def test_a_mounting_stated_in_a_list(tmp_path: Path):
+    """Directions of two axes: the third follows; any other text is refused."""
+    worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    listed = tmp_path / "list.toml"
+    row = '[pelvis]\nfile = "MT_1-000_00B42D4B.txt"\nmount = "%s"\n'
+    for text, axes in (
+        ("x up, z back", [[0, 0, -1], [1, 0, 0], [0, -1, 0]]),
+        ("Y up X forward", np.eye(3)),
+        ("z right; y down", [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]),
+    ):
+        listed.write_text(row % text)
+        turn = Rotation.from_quat(not_none(read(listed)[0].mounting), scalar_first=True)
+        np.testing.assert_allclose(turn.as_matrix(), axes, atol=1e-9)
+    for text in (
+        "x up",
+        "x up x back",
+        "x up, y down",
+        "x up, z behind",
+        "x up, z back please",
+        "x up, y back, z right",
+    ):
+        listed.write_text(row % text)
+        with pytest.raises(PblError, match="a mount ") as wrong:
+            read(listed)
+        assert wrong.value.code == "USAGE"
+    listed.write_text('[pelvis]\nfile = "a.csv"\nmount = ["x up", "z back"]\n')
+    with pytest.raises(PblError, match="USAGE"):
+        read(listed)
+    sheet = tmp_path / "list.csv"
+    sheet.write_text('segment,file,mount\npelvis,MT_1-000_00B42D4B.txt,"x up, z back"\n')
+    assert given_sensors(str(sheet))[0].mount == "x up, z back"
+
+
 GYR, ACC, QUAT = (
     [f"gyr_{a}" for a in "xyz"],
     [f"acc_{a}" for a in "xyz"],
@@ -307,6 +340,9 @@ def test_a_sensor_or_a_segment_twice(tmp_path: Path):
     other = Swing(phase=1).write(tmp_path / "other.csv")
     assert "on shank_r: one of them twice" in refused(f"shank_r={path}", f"shank_r={other}").found
     assert "the sensor a on shank_l: one of them twice" in refused(f"shank_r={path}", f"shank_l={path}").found
+    dead = Swing().own().drop(columns=QUAT).assign(**dict.fromkeys(GYR + ACC, 0.0))
+    given = [f"shank_{side}={Swing().write(tmp_path / f'{side}.csv', dead)}" for side in "rl"]
+    assert "accelerations of typically 0" in refused(*given).found
     assert "a sensor on knee" in refused(f"knee={path}").found
     assert refused(path).code == "USAGE"  # no name that says a segment
     assert refused(f"shank_r={tmp_path / 'none.csv'}").code == "FILE_MISSING"
@@ -396,6 +432,21 @@ def test_lists_with_semicolons_and_with_an_empty_last_cell(tmp_path: Path):
     for text in ("segment;file\nshank_r;a.csv\n", "segment,file,sensor\nshank_r,a.csv,,\n"):
         path.write_text(text)
         assert given_sensors(str(path)) == [Given(tmp_path / "a.csv", "shank_r")]
+
+
+def test_a_list_that_names_no_file_is_refused(tmp_path: Path):
+    """A fit without sensors would be a silent one."""
+    for name, text, found in (
+        ("a.toml", "", "no sensors"),
+        ("a.csv", "segment,file\n", "no sensors"),
+        ("b.csv", "segment,file\nshank_r\n", "a row without a file"),
+        ("b.toml", 'shank_r = ""\n', "a row without a file"),
+        ("c.toml", "shank_r = 3\n", "TypeError"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(PblError, match=found) as wrong:
+            given_sensors(str(tmp_path / name))
+        assert wrong.value.code == "FILE_FORMAT"
 
 
 def test_no_sensors_on_the_command_line():

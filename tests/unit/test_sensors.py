@@ -13,7 +13,7 @@ from pbl_pipeline.body import body_frames, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit, fit_session
 from pbl_pipeline.fit.checks import _sensors
-from pbl_pipeline.fit.wearables import FLOOR_SHARES, floor_shares, shares_of_floors
+from pbl_pipeline.fit.wearables import FLOOR_SHARES, _mount, floor_shares, shares_of_floors
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import FAIL, PASS, WARN
 from pbl_pipeline.records import plain
@@ -100,6 +100,22 @@ def test_clock_and_mounting_are_found(truth, seen, stated):
     for sensor in sensors:
         found = Rotation.from_matrix(wahba(vectors(seen, clock, sensor, sensor.log.segment)))
         assert np.rad2deg((found * mounts[sensor.log.segment].inv()).magnitude()) < 12
+
+
+def test_a_stated_mounting_starts_the_pelvis_and_must_not_contradict_gravity(truth, seen):
+    """Also where there is no acceleration: the walking direction is not needed."""
+    logs, mounts = synthetic.worn(truth, 3, ("pelvis",), clock_s=0.1)
+    given = oriented(logs[0]).at(logs[0].time)[0]
+    alone = dataclasses.replace(logs[0], rate=None, acceleration=None, orientation=given)
+    for turn, refused in (("y", False), ("x", True)):  # of a person who stands: about the vertical, to the side
+        stated = Rotation.from_euler(turn, 60, degrees=True) * mounts["pelvis"]
+        log = dataclasses.replace(alone, mounting=stated.as_quat(scalar_first=True))
+        if refused:
+            with pytest.raises(PblError, match="off gravity") as wrong:
+                _mount([seen], [0.1], oriented(log))
+            assert wrong.value.code == "FIT_INPUT"
+        else:
+            np.testing.assert_allclose(_mount([seen], [0.1], oriented(log)), stated.as_matrix(), atol=1e-9)
 
 
 def test_orientation_alone_is_enough(truth, seen):

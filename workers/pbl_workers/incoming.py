@@ -30,11 +30,12 @@ from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
-from pbl_pipeline.sensors import Given, read_given
+from pbl_pipeline.sensors import Given, named, read_given
 from pbl_pipeline.video import read_first, read_phone_log
 from pbl_schemas import video, worker
 from pbl_schemas.connection import dj
 from pbl_schemas.intake import OneCamera, Registered, Sensors, VisitRecord, register
+from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
 from pbl_schemas.operations.archive import (
     COPIES,
@@ -284,9 +285,20 @@ def check_log(path: Path) -> None:
     _within_limits(read_phone_log, path, LOG_S, LOG_BYTES)
 
 
-def check_worn(sensors: Sequence[Given]) -> None:
-    """Read logs of wearable sensors in a process with limits. Raises `PblError` as `read_given`; MACHINE_SHORT."""
-    _within_limits(read_given, sensors, LOG_S, LOG_BYTES)
+def attach_log(session_id: int, file: Path, segment: str) -> list[str]:
+    """Attach the log of a wearable sensor, which is read in a process with limits, to a visit; returns its segments.
+    `segment`: "" where the names of the sensors in it tell them.
+
+    Raises `PblError` USAGE without a recording; what `read_given` raises; MACHINE_SHORT.
+    """
+    one = Given(file, segment or None)
+    try:
+        _within_limits(read_given, [one], LOG_S, LOG_BYTES)
+        worn = named(one)
+        attach_worn(session_id, worn)
+    except PblError as error:
+        raise error.with_key(file.name) from error
+    return [sensor.segment for sensor in worn if sensor.segment]
 
 
 def _within_limits(read: Callable[[Any], object], file: Path | Sequence[Given], seconds: float, n_bytes: int) -> None:

@@ -15,18 +15,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.sensors import Given, named
 from pbl_pipeline.temporary import new_folder
 from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.intake.sensors import attach_worn as attach_to_visit
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_log, check_opens, check_room, check_worn, keep_free, register_copies
+from .incoming import Copy, attach_log, check_log, check_opens, check_room, keep_free, register_copies
 from .registry import FIRST
 
 
@@ -157,22 +155,11 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
 
 
 def attach_worn(phone: Phone, name: str, segment: str, body: bytes) -> list[str]:
-    """Attach the log of a wearable sensor to the phone's visit; returns its segments. `segment`: "" where the names of
-    the sensors in it tell them.
-
-    Raises `PblError` USAGE without a recording; what `read_given` raises; MACHINE_SHORT.
-    """
+    """Attach the log of a wearable sensor to the phone's visit, as `attach_log`."""
     with new_folder() as folder:
         file = folder / plain_name(name)
         file.write_bytes(body)
-        one = Given(file, segment or None)
-        try:
-            check_worn([one])
-            worn = named(one)
-            attach_to_visit(phone.session_id, worn)
-        except PblError as error:
-            raise error.with_key(file.name) from error
-    return [sensor.segment for sensor in worn if sensor.segment]
+        return attach_log(phone.session_id, file, segment)
 
 
 def discard(phone: Phone, sent: Sent) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from .. import session
+from .. import session, video
 from ..capture import RECEIVED, REFUSED, UPLOADING, PhoneLink, PhoneRecording, Protocol
 from ..job_errors import as_text, stored_error
 from ..reading.usable import Usable, verdicts
@@ -253,9 +253,17 @@ def recordings(session_id: int) -> list[tuple[Sent, Usable | None]]:
     return [(one, None if one.video_id is None else judged[one.video_id]) for one in sent]
 
 
+def log_missing(session_id: int, sent: list[tuple[Sent, Usable | None]]) -> bool:
+    """Return whether sensors were worn, as a phone said, and the visit has none of their logs."""
+    said = any(one.about.get("worn") for one, _ in sent)
+    return (
+        said and not video.WearableImu & "imu_segments IS NOT NULL" & (video.Video & {"session_id": session_id}).proj()
+    )
+
+
 def filming(session_id: int) -> dict[str, Any]:
     """Return how a visit is filmed with phones: "links" that are open, without their sums; the `recordings` "sent";
-    "several", whether more than one phone sent some."""
+    "several", whether more than one phone sent some; `log_missing`."""
     rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
     links = [row for row in rows if row["link_expires"] > utc_now()]
     kept = ("phone_link", "link_by", "link_expires")
@@ -265,6 +273,7 @@ def filming(session_id: int) -> dict[str, Any]:
         "links": [{**{name: link[name] for name in kept}, "used": bool(link["link_phone_sha256"])} for link in links],
         "sent": sent,
         "several": len(phones) > 1,
+        "log_missing": log_missing(session_id, sent),
     }
 
 

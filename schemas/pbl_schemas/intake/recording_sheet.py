@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.progress import track
+from pbl_pipeline.sensors import given_sensors, named
 from pbl_pipeline.video import recorded_utc
 
 from .. import lab, session
 from ..rows import rows_inside
 from ..subject_codes import day_of
-from ..transactions import in_transaction
 from ..video import CAMERA_MOTIONS
 from .records import Methods, VisitRecord
-from .registration import check_owner, registered, resolve, write
-from .sensors import Sensors
+from .registration import check_owner, insert_new, registered, resolve
+from .sensors import NONE, Sensors
 from .sheets import (
     Imported,
     Line,
@@ -41,8 +43,10 @@ NEEDED = ("file", "subject", "visit")
 COLUMNS = (
     *NEEDED,
     *("date", "pace", "activity", "camera", "camera_motion", "attitude", "person", "population", "height_m", "project"),
-    "mass_kg",
+    *("mass_kg", "depth", "imu"),
 )
+#: Columns that name files.
+_FILES = ("file", "camera", "attitude", "depth", "imu")
 _ONE_VISIT = "one value; two visits need two labels"
 
 
@@ -62,32 +66,38 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     _check_people(visits, lines)
     new: list[tuple[Row, Line, OneCamera]] = []
     seen: dict[str, str] = {}
-    for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
-        if "file" not in row.cells:
-            continue
-        with line.about():  # the file also of a row that is refused: all errors are found together
-            one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
-            one.read()
-            sha256, file = one.files[0].sha256, row.cells["file"]
-            if (first := seen.setdefault(sha256, row.where)) != row.where:
-                with line.about():
-                    raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
-            if visit is None or line.errors:
-                one.complete(chosen)
+    worn: dict[tuple[str, str], str] = {}
+    with ExitStack() as copies:
+        for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
+            if "file" not in row.cells:
                 continue
-            _check_day(one, line)
-            if known := registered(one.files):
-                _check_place(one, known)
-                line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
-            else:
-                one.complete(chosen)
-                new.append((row, line, one))
-                line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
-    done = not dry_run and not any(line.errors for line in lines)
-    if done and new:
-        made = in_transaction(lambda: write([one for *_, one in new], chosen))
-        for (row, line, _), result in zip(new, made, strict=True):
-            line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
+            with line.about():  # the file also of a row that is refused: all errors are found together
+                one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
+                one.read()
+                copies.callback(one.sensors.remove_copies)
+                sha256, file = one.files[0].sha256, row.cells["file"]
+                if (first := seen.setdefault(sha256, row.where)) != row.where:
+                    with line.about():
+                        raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
+                if visit is None or line.errors:
+                    one.complete(chosen)
+                    continue
+                _check_day(one, line)
+                if text := row.cells.get("imu"):
+                    key = visit.subject, visit.session_label
+                    check_same(worn.setdefault(key, text), text, "imu", ", ".join(key), "one list of all its sensors")
+                if known := registered(one.files):
+                    _check_place(one, known)
+                    line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
+                else:
+                    one.complete(chosen)
+                    new.append((row, line, one))
+                    line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
+        done = not dry_run and not any(line.errors for line in lines)
+        if done and new:
+            made = insert_new([one for *_, one in new], chosen)
+            for (row, line, _), result in zip(new, made, strict=True):
+                line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
     return Imported(lines, done)
 
 
@@ -119,7 +129,7 @@ def _visit(row: Row, line: Line, folder: Path) -> VisitRecord | None:
     for column in dict.fromkeys((*NEEDED, *row.cells)):
         with line.about():
             text = needed(row, column)
-            if column not in ("file", "camera", "attitude"):
+            if column not in _FILES:
                 field = "session_label" if column == "visit" else column
                 replace(_blank(row, folder), **{field: (value := _value(row, column, text))}).check()
                 visit = replace(visit, **{field: value})
@@ -200,8 +210,11 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
 
 
 def _recording(row: Row, visit: VisitRecord, folder: Path) -> OneCamera:
-    log = row.cells.get("attitude")
-    return OneCamera(folder / row.cells["file"], visit, Sensors(attitude=folder / log if log else None))
+    """Return the record of a row. Raises what `given_sensors` and `named` raise."""
+    log, depth, imu = ("" if (text := row.cells.get(k, "")) == NONE else text for k in ("attitude", "depth", "imu"))
+    worn = [sensor for one in given_sensors(imu, folder) for sensor in named(one)] if imu else ()
+    sensors = Sensors(folder / log if log else None, DepthFile.of(depth, folder) if depth else None, worn)
+    return OneCamera(folder / row.cells["file"], visit, sensors)
 
 
 def _check_place(one: OneCamera, known: Mapping[str, Mapping]) -> None:

@@ -7,7 +7,7 @@ files are read and checked (`Recording.read`), and then written, or compared wit
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from ..operations import catalog
 from ..plan import default_fit
 from ..queues import forget_errors
 from ..rows import PART, insert_in_parts, inside, rows_inside, utc_now
-from ..transactions import in_transaction, next_id
+from ..transactions import in_transaction, keep_files, next_id
 from .calibrations import camera_id_of
 from .records import (
     File,
@@ -171,14 +171,11 @@ def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> lis
         return _update(one, known, chosen, named)
     one.complete(chosen)
     try:
-        done = in_transaction(lambda: write([one], chosen), lambda: bool(registered(one.files)), fresh=True)
+        return insert_new([one], chosen, lambda: bool(registered(one.files)))
     except DuplicateError:
         if not (known := registered(one.files)):
             raise
         return _update(one, known, chosen, named)
-    if getattr(one, "sensors", None):
-        forget_errors(int(done[0].video_id or 0))  # fits of the visit may have failed by its older sensors
-    return done
 
 
 def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
@@ -203,6 +200,19 @@ def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
                 f"pbl move {row['video_id']} --to {visit.subject}/{visit.session_label}",
                 key=file.path,
             )
+
+
+def insert_new(
+    recordings: Sequence[Recording], chosen: Mapping[str, str], until: Callable[[], bool] = lambda: False
+) -> list[Registered]:
+    """`write` in a transaction (`keep_files`)."""
+    done = keep_files(lambda: write(recordings, chosen), until)
+    numbers = iter(result.video_id for result in done)
+    for one in recordings:
+        first, *_ = (next(numbers) for _ in one.files)
+        if getattr(one, "sensors", None):
+            forget_errors(int(first or 0))  # fits of the visit may have failed by its older sensors
+    return done
 
 
 def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Registered]:

@@ -16,10 +16,10 @@ from pbl_pipeline.records import number
 from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from .. import fit, keypoints, session, video
-from ..job_errors import store_full
 from ..queues import forget_errors
 from ..rows import counted, delete_below, utc_now
-from ..transactions import in_transaction
+from ..store import unkept
+from ..transactions import keep_files
 from .records import usage
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 #: As a path of `--attitude`, `--depth` or `--imu`: none for this video or at its visit, or no longer.
 NONE = "none"
+_KINDS = {"attitude": "phone's log", "depth": "depth recording", "imu": "wearable sensor's log"}
 _NOT_READ = ", kept and not read: not a folder, .r3d or zip (docs/depth.md)"
 
 
@@ -63,23 +64,22 @@ class Sensors:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
         FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
-        USAGE as `read_given`; STORE_FULL: no room for the zip of a folder.
+        USAGE as `read_given`; USAGE for a name that cannot be kept; STORE_FULL: no room for the zip of a folder.
         """
         from pbl_pipeline.depth import check_recording, pack
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
-        depth = {self.depth.file} if self.depth is not None else set()
-        for path in depth:
-            check_label("name of the depth recording", path.name, 255)
-        for path in (*depth, *(given.file for given in self.imu)):
-            if str(path) != NONE and not path.is_dir():
+        files = [("attitude", self.attitude), ("depth", self.depth and self.depth.file)]
+        files += [("imu", given.file) for given in self.imu]
+        there = list(dict.fromkeys((prefix, path) for prefix, path in files if path and str(path) != NONE))
+        for prefix, path in there:
+            check_label(f"name of the {_KINDS[prefix]}", path.name, 255)
+            if prefix != "attitude" and not path.is_dir():
                 _check_there(path)
         logs = iter(read_given([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        files = {("attitude", self.attitude), *(("imu", g.file) for g in imu), *(("depth", path) for path in depth)}
-        there = [(prefix, path) for prefix, path in files if path is not None and str(path) != NONE]
         kept: dict[tuple[str, Path], Kept] = {}
         room = None
         try:
@@ -91,9 +91,7 @@ class Sensors:
                 copy = zip_of(path, room.path / f"{prefix}{len(kept)}.zip") if room and path.is_dir() else path
                 kept[prefix, path] = Kept(copy, sha256_of(copy))
         except OSError as error:
-            found, key = error.strerror or str(error), error.filename
-            next_step = "check the path, and that you may read the file"
-            raise store_full(error) or PblError("FILE_MISSING", found, "files to keep", next_step, key) from error
+            raise unkept(error) from error
         finally:
             if room and len(kept) < len(there):
                 room.cleanup()
@@ -136,7 +134,7 @@ def attach_worn(session_id: int, given: Sequence[Given]) -> list[str]:
 
 def attach_now(video_id: int, worn: Sensors) -> list[str]:
     """Attach sensors that a person wore, which were read, in a transaction; returns it in words."""
-    done = in_transaction(lambda: attach(video_id, worn, None), fresh=True)
+    done = keep_files(lambda: attach(video_id, worn, None))
     if done:
         forget_errors(video_id)  # fits of the visit may have failed by its older sensors
     return done
@@ -195,22 +193,25 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
     of a segment takes the place of the visit's older one. Raises what `fit.check_sensors` raises for all together."""
     if not given:
         return []
-    files: dict[tuple[Path, float | None], dict[str, str]] = {}
+    files: dict[tuple[Path, float | None], tuple[dict[str, str], dict[str, str]]] = {}
     for one in given:
-        own = files.setdefault((one.file, one.rate_hz), {})
+        own, mounts = files.setdefault((one.file, one.rate_hz), ({}, {}))
         own |= {} if one.segment is None else {one.segment: one.sensor or ""}
+        mounts |= {one.segment: one.mount} if one.segment and one.mount else {}
     visit = int((video.Video & key).fetch1("session_id"))
     session.lock(visit)  # no fit is inserted from here on
     of_visit = video.WearableImu & (video.Video & {"session_id": visit}).proj()
     done, worn = [], False
-    for (file, rate), own in files.items():
+    for (file, rate), (own, mounts) in files.items():
         rows = of_visit.to_dicts()
         sha256 = None if str(file) == NONE else kept["imu", file].sha256
         if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
             before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
-            own = {s: name for s, name in before.items() if name not in own.values()} | own
-            if (before, same["imu_rate"]) == (own, rate):
+            others = {s: name for s, name in before.items() if s not in own and name not in own.values()}
+            own, mounts = others | own, {s: m for s, m in (same["imu_mounts"] or {}).items() if s in others} | mounts
+            if (before, same["imu_rate"], same["imu_mounts"] or {}) == (own, rate, mounts):
                 continue
+        replaced = []
         for row in rows:
             this = {k: row[k] for k in video.WearableImu.primary_key}
             segments = row["imu_segments"] or {}
@@ -220,14 +221,16 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
             elif left != segments:
                 video.WearableImu.update1({**this, "imu_segments": left})
             worn |= left != segments or (sha256 is None and bool(segments))
+            replaced += [row["imu_name"]] if left != segments and row["imu_sha256"] != sha256 else []
         if sha256 is None:
             done += ["the wearable sensors were removed"] if rows else []
             continue
         number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
-        about = {"imu_segments": own or None, "imu_rate": rate}
+        about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
         _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
         where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
-        done.append(f"wearable IMU file {file.name} was attached, {where}")
+        instead = f" instead of {', '.join(replaced)}" if replaced else ""
+        done.append(f"wearable IMU file {file.name} was attached{instead}, {where}")
         worn |= bool(own)
     if worn:
         done += fit.check_sensors(visit)

@@ -17,7 +17,7 @@ from .. import fit, video
 from ..datajoint_setup import dj
 from ..queues import forget_errors
 from ..rows import utc_now
-from ..transactions import in_transaction, next_id
+from ..transactions import in_transaction, keep_files, next_id
 from .calibrations import camera_id_of, camera_row, known_camera
 from .records import File, Methods, Recording, RefusedFile, Registered, VisitRecord, usage
 from .registration import register
@@ -202,7 +202,7 @@ class OneCamera(Recording):
     def update(self, row: Mapping[str, Any]) -> list[str]:
         done = self._new_camera(row) if self.visit.camera_file else []
         if self.sensors:
-            done += in_transaction(lambda: self._new_sensors(row), fresh=True)
+            done += keep_files(lambda: self._new_sensors(row))
         if done:
             forget_errors(int(row["video_id"]))  # a failure with the other camera or log may not recur
         return done

@@ -9,10 +9,10 @@ from ..capture import PhoneLink, PhoneRecording
 from ..jobs import jobs_of
 from ..operations.catalog import quote
 
-#: Tables beside the computed ones and their queues: recordings, decisions, sets, links with their protocols. The rows
-#: of others, and parts, change with rows of these.
-_STATED = (video.Video, video.RigView, video.NotUsable, tracking.TrackingSelection, fit.FitSet, fit.FitSelection,
-           gait.EventCorrection, PhoneLink, PhoneRecording)  # fmt: skip
+#: Tables beside the computed ones and their queues: recordings, sensors, decisions, sets, links with their protocols.
+#: The rows of others, and parts, change with rows of these.
+_STATED = (video.Video, video.RigView, video.WearableImu, video.NotUsable, tracking.TrackingSelection, fit.FitSet,
+           fit.FitSelection, gait.EventCorrection, PhoneLink, PhoneRecording)  # fmt: skip
 #: Columns of a queue that change what is said of a job.
 _OF_A_JOB = ("status", "error_message", "reserved_time", "scheduled_time", "priority")
 #: Names in `state_of` by which the index of a visit changes.

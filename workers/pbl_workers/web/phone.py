@@ -240,11 +240,12 @@ class Phones:
         if session_id not in self._worth or self._worth[session_id][0] != results:
             self._worth[session_id] = results, next_pass(session_id)
         sent = phone_recordings.recordings(session_id)
+        missing = texts.text(language, "worn.missing") if phone_recordings.log_missing(session_id, sent) else ""
         told = {
             "visit": session_id,
             "recordings": [_shown(language, one, judged) for one, judged in sent],
             "checked": sum(judged is not None and judged.state == PENDING for _, judged in sent),
-            "next": next_words(language, self._worth[session_id][1]),
+            "next": f"{missing} {next_words(language, self._worth[session_id][1])}".strip(),
             "protocol": [dataclasses.asdict(step) for step in steps_of(session_id, sent)],
         }
         body = json.dumps(told).encode()

@@ -13,6 +13,7 @@ from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.sensors import SEGMENTS
 from pbl_schemas import lab
 from pbl_schemas.studies import visit_forms
 
@@ -93,6 +94,7 @@ def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes
 
     values = {"activity": "walking", "pace": "", **values}
     more = {"choices": {"activity": ACTIVITIES, "pace": PACES}, "accepted": ", ".join(VIDEO_ENDINGS)}
+    more["segments"] = SEGMENTS
     return pages.show(request, "upload.html", to=to, values=values, outcomes=outcomes, **more)
 
 
@@ -106,7 +108,9 @@ async def send(request: Request) -> Response:
     arriving: list[Arriving] = []
     try:
         fields, outcomes, whole = await _receive(request, to, arriving)
-        stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
+        stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace", "segment")}
+        if stated["segment"] not in ("", *SEGMENTS):
+            raise Refused("form")
         good = []
         videos = {Path(one.name).stem for one, _ in whole if not one.is_log}
         for one, copy in whole:
@@ -132,9 +136,8 @@ async def taken_in(
     request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
 ) -> list[Received]:
     for _ in range(int(_WAIT_S) if good else 0):
-        done = await site.ask(
-            request, browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
-        )
+        said = stated["activity"], stated["pace"], sender(request), stated["segment"]
+        done = await site.ask(request, browser_uploads.register, to, good, *said)
         if done is not None:
             return done
         await asyncio.sleep(1.0)
@@ -205,7 +208,7 @@ async def _begin(to: Place, part: Part, outcomes: list[Received]) -> Arriving | 
     assert part.file is not None
     check_fields({part.name: part.file})
     try:
-        return await _on_disk(Arriving, to, part.file)
+        return await _on_disk(Arriving, to, part.file, part.name == "worn")
     except PblError as error:
         if error.code != "UPLOAD_REFUSED":
             raise
