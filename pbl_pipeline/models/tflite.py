@@ -23,8 +23,8 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import cores
 
-#: Places of fields in the tables of the file: of the model, and of its graph.
-_SIGNATURES, _OUTPUTS, _OPERATORS = 18, 8, 10
+#: Places of fields in the table of a graph.
+_OUTPUTS, _OPERATORS = 8, 10
 
 
 def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
@@ -56,14 +56,11 @@ def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
             needed.add(number)
             open_tensors += [t for t in operators[number].InputsAsNumpy().tolist() if t >= 0]
     # In place: unpacking and packing the file takes a hundred megabytes and longer than loading it.
-    first = graph._tab.Vector(graph._tab.Offset(_OPERATORS))
-    places = [operators[n]._tab.Pos - first - 4 * i for i, n in enumerate(sorted(needed))]  # counted from each entry
-    struct.pack_into(f"<{1 + len(places)}I", content, first - 4, len(places), *places)
-    first = graph._tab.Vector(graph._tab.Offset(_OUTPUTS))
-    struct.pack_into(f"<{1 + len(outputs)}I", content, first - 4, len(outputs), *outputs)
-    if root._tab.Offset(_SIGNATURES):  # they name removed outputs; no model is called by its signature here
-        (back,) = struct.unpack_from("<i", content, root._tab.Pos)
-        struct.pack_into("<H", content, root._tab.Pos - back + _SIGNATURES, 0)
+    at = graph._tab.Vector(graph._tab.Offset(_OPERATORS))
+    places = [operators[n]._tab.Pos - at - 4 * i for i, n in enumerate(sorted(needed))]  # counted from each entry
+    for field, values in ((_OPERATORS, places), (_OUTPUTS, outputs)):
+        at = graph._tab.Vector(graph._tab.Offset(field))
+        struct.pack_into(f"<{1 + len(values)}I", content, at - 4, len(values), *values)
     return bytes(content)
 
 
