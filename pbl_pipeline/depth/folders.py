@@ -17,7 +17,6 @@ from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
@@ -131,6 +130,8 @@ def _matrix(get: Get, name: str, size_px: tuple[int, int], turn_deg: int, wrong:
 def _odometry(get: Get) -> tuple[np.ndarray, int]:
     """Times (s) of the frames from 0 on, and the clockwise turn (deg) that makes the pictures upright; 0 where the file
     does not state how the phone was held."""
+    import pandas as pd
+
     text = get("odometry.csv", bounded.MAX_TEXT).decode("utf-8-sig")
     rows = pd.read_csv(io.StringIO(text), skipinitialspace=True)
     time, names = rows["timestamp"].to_numpy(float), ["qx", "qy", "qz", "qw"]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from pbl_pipeline.body import angle_of, joint_angles
 from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.errors import PblError
 
 from .results import TrialFit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def angles_table(fit: TrialFit) -> pd.DataFrame:
@@ -33,6 +36,8 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
             next_step="fit the trial again; this fit is damaged",
             key=fit.name,
         )
+    import pandas as pd  # not at the top: the walk is measured before it is needed
+
     columns: dict[str, np.ndarray] = {"time_s": np.asarray(fit.time_s, float)}
     angles = joint_angles(fit.joint_names, fit.observed_qpos)
     for joint, values in zip(fit.joint_names, qpos.T, strict=True):

@@ -67,8 +67,12 @@ class Found:
         return np.stack([np.arange(1, n + 1), np.asarray(self.end.trace)[:n]], axis=1).astype(np.float64)
 
 
+#: Inlined. All programs that evaluate a problem of the same sizes share the second that tracing it takes.
+_evaluate = jax.jit(linearise, static_argnames="body", inline=True)
+
+
 def _solver(body: Body, p: Problem, w: Weights) -> LevenbergMarquardt[State]:
-    return LevenbergMarquardt(lambda state: linearise(body, p, w, state), moved, p.weight)
+    return LevenbergMarquardt(lambda state: _evaluate(body, p, w, state), moved, p.weight)
 
 
 def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:

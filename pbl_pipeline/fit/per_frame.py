@@ -46,6 +46,8 @@ from .weights import Weights
 STANDING_FRACTION, STANDING_M_PER_S, STANDING_S = 0.25, 0.2, 0.03
 #: Knees at their straight end in more than this fraction of the frames may belong to a body that faces the wrong way.
 BACKWARDS_FRACTION = 0.2
+#: Iterations between two steps of the bar: each call of the program takes new memory, which costs half an iteration.
+SHOWN = 8
 
 
 def solve_per_frame(
@@ -190,14 +192,15 @@ def _with_detector(start: State, params: GaussNewtonParams) -> State:
 
 
 def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """`fit_one` with a bar that moves with each iteration; all at once if no bar is shown."""
+    """`fit_one` with a bar that moves every few iterations; all at once if no bar is shown."""
     if not progress.enabled():
         return fit_one(body, p, w, begin, limits)
-    most, at = int(limits.iterations), begin
+    most, at, done = int(limits.iterations), begin, 0
     with progress.bar("fit", unit=" iterations") as update:
-        for n in range(most + 1):  # the first one evaluates the start
+        for n in (*range(SHOWN, most, SHOWN), most):
             at = fit_one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
-            update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
+            done, before = int(at.iteration), done
+            update(done - before, f"of at most {most}, cost {float(at.cost):.4g}")
             if int(at.result) != Result.MAX_STEPS_REACHED:
                 break
     return at

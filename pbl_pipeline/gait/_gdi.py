@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
@@ -435,9 +436,8 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
 def minimal_change_of(sd_anew: float) -> float:
     """Return the minimal detectable change (90 %) between two visits, whose new errors have the standard deviation
     `sd_anew` each."""
-    from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
-
-    return minimal_detectable_change(sd_anew, 0.9)
+    # As `stats.minimal_detectable_change`, which loads `scipy.stats` and pandas: every command would wait for them.
+    return float(-ndtri((1 - 0.9) / 2) * np.sqrt(2) * sd_anew)
 
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:

@@ -82,12 +82,12 @@ class Measure:
         """
         if self.error_sd is not None:
             return self.mean - Z90 * self.error_sd, self.mean + Z90 * self.error_sd
-        from scipy.stats import t  # takes longer to import than most commands run
+        from scipy.special import stdtrit  # not `scipy.stats`, which takes longer to import than most commands run
 
         sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)
         if sd is None or freedom < 1:
             return None
-        half = float(t.isf(0.05, freedom)) * sd / math.sqrt(self.n)
+        half = float(-stdtrit(freedom, 0.05)) * sd / math.sqrt(self.n)
         return self.mean - half, self.mean + half
 
 

@@ -246,7 +246,12 @@ def scaled_matrix(matrix: np.ndarray, factor: float | tuple[float, float]) -> np
 
 def turning_radius2(camera: Camera) -> float:
     """Squared normalised radius where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it never does."""
-    k1, k2, _, _, k3 = np.asarray(camera.distortion, float)
+    k1, k2, _, _, k3 = (float(k) for k in camera.distortion)
+    return _turning_radius2(k1, k2, k3)
+
+
+@functools.lru_cache(maxsize=8)
+def _turning_radius2(k1: float, k2: float, k3: float) -> float:
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-12].real
     return float(min(real[real > 0], default=np.inf))

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import av
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
+from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.sampling import interval_of
 
 _TICKS_PER_S = 90_000  # time base of the output: every common frame rate is a whole number of ticks
+_AHEAD = 4  # pictures made ahead while one is encoded
 
 
 def write_h264(
@@ -55,9 +57,14 @@ def write_h264(
         # Untagged video is guessed to be BT.601 or BT.709 by its size; with the tag the colours are right everywhere.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
-        for t, picture in pictures:
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24").reformat(
-                format=layout, dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+        converter = VideoReformatter()
+        for t, picture in prefetched(pictures, _AHEAD):
+            frame = converter.reformat(
+                av.VideoFrame.from_numpy_buffer(picture, format="bgr24"),
+                format=layout,
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+                threads=1,
             )
             frame.pts, frame.time_base = round(t * _TICKS_PER_S), Fraction(1, _TICKS_PER_S)
             out.mux(_timed(stream.encode(frame), last))

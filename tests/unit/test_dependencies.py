@@ -50,6 +50,14 @@ def test_importing_the_tables_loads_no_numerical_library():
     assert done.stdout.split() == []
 
 
+@pytest.mark.slow
+def test_a_recording_does_not_wait_for_what_only_tables_need():
+    code = "import sys, pbl_pipeline.pipeline; print(*({'pandas', 'scipy.stats', 'scipy.signal'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.split() == []
+
+
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [

@@ -23,6 +23,7 @@ from pbl_pipeline.gait import (
     score_gdi,
 )
 from pbl_pipeline.gait.normative.norm import _checksum, _to_json
+from pbl_pipeline.stats import minimal_detectable_change
 from tests import not_none
 
 PERCENT = np.linspace(0, 98, 50)
@@ -177,7 +178,8 @@ def test_the_index_is_as_unsure_as_its_angles_and_its_cycles(toy, average):
     assert result.mean is not None
     half = 1.645 * float(np.sqrt(fit + walk))
     assert result.interval == pytest.approx((result.mean - half, result.mean + half), rel=1e-3)
-    assert result.minimal_change == pytest.approx(1.645 * np.sqrt(2 * (0.25 * fit + walk)), rel=1e-3)
+    least = minimal_detectable_change(float(np.sqrt(0.25 * fit + walk)), 0.9)
+    assert result.minimal_change == pytest.approx(least, rel=1e-3)
     content = result.to_dict()
     assert content["interval"] == pytest.approx(result.interval, abs=2e-3)
     # A reader of the file gets it again from the mean and sd beside it, which are rounded.

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline import progress
 from pbl_pipeline.body import load_body, marker_positions, marker_set, stature_m
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import (
@@ -320,6 +321,17 @@ def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, limit
     for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
         assert isinstance(fit, SessionFit)
         assert_same(alone, fit)
+
+
+def test_a_bar_changes_no_result(walkers, one_by_one):
+    progress.enable()
+    try:
+        [shown] = fit_sessions(walkers[:1], PARAMSET)
+    finally:
+        progress.enable(False)
+    assert isinstance(shown, SessionFit)
+    np.testing.assert_array_equal(shown.trials[0].qpos, one_by_one[0].trials[0].qpos)
+    np.testing.assert_array_equal(shown.loss_trace, one_by_one[0].loss_trace)
 
 
 def test_sessions_with_other_terms_are_not_solved_together(walkers):

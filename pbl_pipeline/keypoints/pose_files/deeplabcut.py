@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from pbl_pipeline.bounded import count_cells, count_rows, read_text
 from pbl_pipeline.csv_cells import unquoted
@@ -38,6 +37,8 @@ def read_dlc_csv(path: Path) -> Poses:
                 raise ValueError(f"lines that begin with {', '.join(head)}"[:200])
             count_rows(len(lines))
             count_cells(len(lines) * (1 + lines[0].count(",")), 1 + lines[0].count(","))
+            import pandas as pd  # not at the top: `pbl run` reads no such file
+
             table = pd.read_csv(io.StringIO(text), header=list(range(levels)), index_col=0)
             values, index = table.to_numpy(float), table.index.to_numpy()
         except ValueError as error:

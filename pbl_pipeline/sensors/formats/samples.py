@@ -10,13 +10,16 @@ import io
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError, os_errors_as
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Bytes of a log, unpacked: six sensors in one file at 128 Hz for 20 minutes.
 MAX_LOG = 4 * bounded.MAX_TEXT
@@ -102,6 +105,8 @@ def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] 
 
     Raises `PblError` SENSOR_LOG.
     """
+    import pandas as pd
+
     expected = "rows with a cell for each name in the header"
     try:
         line = next(itertools.islice(io.StringIO(file.text), header, None), "")
@@ -136,11 +141,13 @@ def numbers(file: LogFile, found: pd.DataFrame, names: Sequence[str]) -> np.ndar
 
     Raises `PblError` SENSOR_LOG for a cell that is not a number.
     """
+    from pandas import to_numeric
+
     wanted = [names] if isinstance(names, str) else list(names)
     if not set(wanted) <= set(found.columns):
         return None
     try:
-        values = np.column_stack([np.asarray(pd.to_numeric(found[n].str.strip()), float) for n in wanted])
+        values = np.column_stack([np.asarray(to_numeric(found[n].str.strip()), float) for n in wanted])
     except (ValueError, TypeError) as error:
         raise file.refuse(f"columns {', '.join(wanted)}: {error}", "a number in each cell, or none") from error
     if np.isnan(values).all():
