@@ -90,7 +90,8 @@ class Home:
         self.built: dict[str, Any] = {}
 
     def put(self, build: Callable[[Path], Any]) -> Any:
-        """Make the database what `build` makes of an empty one, given a folder for videos; return what it returns.
+        """Make the database what `build` makes of an empty one, or of its base, which is there, given a folder for
+        videos; return what it returns.
 
         It is built once; after that its files are put back. On MySQL it is built each time.
         """
@@ -98,16 +99,21 @@ class Home:
         if name in self.built:
             put_back(self.path, name)
             return self.built[name]
-        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-            cursor.execute("SET foreign_key_checks = 0")
-            cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
-            for (schema,) in cursor.fetchall():
-                cursor.execute(f"DROP DATABASE {schema}")
+        if build not in BASES:
+            self.empty()
         result = build(self.path)
         if not mysql.chosen():
             self.built[name] = result
             keep(self.path, name)
         return result
+
+    def empty(self) -> None:
+        """Drop all schemas."""
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            cursor.execute("SET foreign_key_checks = 0")
+            cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
+            for (schema,) in cursor.fetchall():
+                cursor.execute(f"DROP DATABASE {schema}")
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +145,8 @@ def put(home: Home, forget: Callable[[], None]) -> Put:
     """`Home.put`, in a process that knows nothing of the database before and after."""
 
     def done(build: Callable[[Path], Any]) -> Any:
+        if build in BASES and build.__name__ not in home.built:
+            done(BASES[build])
         forget()
         result = home.put(build)
         forget()
@@ -156,9 +164,18 @@ def new(folder: Path) -> None:
     pbl_schemas.activate()
 
 
-def without_sizes(folder: Path) -> None:
-    """Compute a visit in tables from before videos had a size and before there was a schema for validation."""
+def one_visit(folder: Path) -> None:
+    """Compute a visit."""
     _visits(folder, "2026-03-01")
+
+
+def two_visits(folder: Path) -> None:
+    """Compute another one."""
+    _visits(folder, "2026-06-01")
+
+
+def without_sizes(folder: Path) -> None:
+    """A visit in tables from before videos had a size and before there was a schema for validation."""
 
     def undo_sizes(cursor: Any) -> None:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
@@ -168,15 +185,14 @@ def without_sizes(folder: Path) -> None:
 
 
 def without_session(folder: Path) -> dict[str, list[tuple]]:
-    """Compute two visits and take migration 0001 back; return the rows of before that, as all builders below."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    """Take migration 0001 back; return the rows of before that, as all builders below."""
+    rows = everything()
     _undo(older_tables.undo_0001)
     return rows
 
 
 def without_instruments(folder: Path) -> dict[str, list[tuple]]:
-    """Declare the tables and take the migrations from 0006 back."""
-    pbl_schemas.activate()
+    """Take the migrations from 0006 back."""
     rows = everything()
     _undo(
         older_tables.undo_0016,
@@ -194,8 +210,8 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
 
 
 def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
-    """Compute a visit whose events are corrected, and take migration 0004 back."""
-    _visits(folder, "2026-03-01")
+    """Correct the events of the visit, and take migration 0004 back."""
+    pbl_schemas.activate()
     found = not_none(event_corrections.shown_events(1))
     (time, side, kind, _), *others = found.events
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
@@ -227,8 +243,8 @@ def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
 
 
 def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
-    """Compute two visits and take migration 0005 back, for the first one."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    """Take migration 0005 back, for the first visit."""
+    rows = everything()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         older_tables.undo_0005(cursor, 1)
         cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
@@ -237,7 +253,7 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
 
 def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     """Freeze three visits, about two of which something was stated in words, and take migration 0011 back."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01", "2026-09-01")
+    rows = _visits(folder, "2026-09-01")
     for number, aid in enumerate(("Keine", "Gehstock", "my own"), 1):
         study.Visit.insert1({"session_id": number, "visit_role": "pre", "assistive_device": aid})
     slices.freeze("of words")
@@ -246,10 +262,18 @@ def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     return rows
 
 
-def _visits(folder: Path, *days: str) -> dict[str, list[tuple]]:
+#: What a builder is given, where that is no empty database.
+BASES: dict[Callable[[Path], Any], Callable[[Path], Any]] = {
+    without_instruments: new,
+    one_visit: new,
+    **dict.fromkeys((two_visits, without_sizes, corrected_by_a_method), one_visit),
+    **dict.fromkeys((without_session, tracked_without_video_info, stated_in_words), two_visits),
+}
+
+
+def _visits(folder: Path, day: str) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
-    for day in days:
-        register(chain.small_video(folder, day), session_label=day)
+    register(chain.small_video(folder, day), session_label=day)
     _compute()
     return everything()
 
