@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import builtins
 import io
+import json
 import os
 import subprocess
 import sys
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,27 +63,39 @@ def install() -> None:
 
 
 def main() -> None:
-    """`pbl` with the arguments of this process."""
+    """Calls of `pbl`, one after the other; their arguments come as JSON, and their ends go as JSON."""
     install()
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(encoding=ENCODING, errors="strict")
     from pbl_pipeline.cli import main as pbl_main
 
-    pbl_main()
+    ends, calls = [], json.loads(sys.argv[1])
+    for sys.argv[1:] in calls:
+        files = io.BytesIO(), io.BytesIO()
+        sys.stdout, sys.stderr = (io.TextIOWrapper(f, ENCODING, "strict", write_through=True) for f in files)
+        try:
+            pbl_main()
+        except SystemExit as end:
+            ends.append([end.code or 0, *(f.getvalue().decode(ENCODING) for f in files)])
+    sys.__stdout__.write(json.dumps(ends))
 
 
-def pbl(*arguments: object, packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> Done:
-    """Run `pbl --quiet ARGUMENTS` in a process of its own without POSIX, with these environment variables, too.
+def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> list[Done]:
+    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, with these environment variables,
+    too.
 
     `packages` is the folder that the project's packages are imported from: this checkout, or an installed wheel.
     """
     from tests.command import Done
 
-    words = [sys.executable, "-P", __file__, "--quiet", *map(str, arguments)]
+    words = [sys.executable, "-P", __file__, json.dumps([["--quiet", *map(str, call)] for call in calls])]
     env = {**os.environ, "PYTHONPATH": str(packages), **(variables or {})}
     done = subprocess.run(words, capture_output=True, env=env, timeout=300, check=False)
-    return Done(done.returncode, done.stdout.decode(ENCODING), done.stderr.decode(ENCODING))
+    assert done.returncode == 0, done.stderr.decode()
+    return [Done(*end) for end in json.loads(done.stdout)]
+
+
+def pbl(*arguments: object, packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> Done:
+    """`each` of one call."""
+    return each(arguments, packages=packages, variables=variables)[0]
 
 
 if __name__ == "__main__":
