@@ -79,8 +79,7 @@ def main() -> None:
 
 
 def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> list[Done]:
-    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, with these environment variables,
-    too.
+    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, with these variables, too.
 
     `packages` is the folder that the project's packages are imported from: this checkout, or an installed wheel.
     """
@@ -93,9 +92,9 @@ def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str
     return [Done(*end) for end in json.loads(done.stdout)]
 
 
-def pbl(*arguments: object, packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> Done:
+def pbl(*arguments: object, **options: Any) -> Done:
     """`each` of one call."""
-    return each(arguments, packages=packages, variables=variables)[0]
+    return each(arguments, **options)[0]
 
 
 if __name__ == "__main__":

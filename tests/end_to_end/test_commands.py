@@ -5,7 +5,6 @@ In a process that finds nothing of POSIX (tests/without_posix.py): what they wri
 import csv
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,53 +12,36 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.gait import MEASURES
-from tests.command import Done
 from tests.without_posix import ENCODING, each, pbl
 
 pytestmark = pytest.mark.slow
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "files.md"
-
-
 EXPORTS = ("trc", "mot", "osim", "csv")
 
 
 @pytest.fixture(scope="module")
-def done(walking: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Done]]:
-    """The commands, in one process, by the names of what they write, and its folder."""
+def here(walking: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the commands wrote, and what the last one printed."""
     here = tmp_path_factory.mktemp("files")
     keypoints, out, fit = here / "walking.keypoints.npz", here / "new folder", here / "new folder" / "walking.fit.npz"
-    calls = {
-        "keypoints": ("detect", walking, "--out", keypoints),
-        "fit": ("fit", keypoints, "--out", out),
-        "events": ("events", fit, "--out", here / "made" / "walking.events.csv"),
-        "e": ("events", keypoints, "--out", here / "e.csv"),
-        "metrics": ("gait", fit, "--out", here / "metrics.json"),
-        "exports": ("export", fit, *(w for name in EXPORTS for w in ("--to", name)), "--out", here / "exports"),
-    }
-    return here, dict(zip(calls, each(*calls.values()), strict=True))
+    done = each(
+        ("detect", walking, "--out", keypoints),
+        ("fit", keypoints, "--out", out),
+        ("events", fit, "--out", here / "made" / "walking.events.csv"),
+        ("events", keypoints, "--out", here / "e.csv"),
+        ("gait", fit, "--out", here / "metrics.json"),
+        ("export", fit, *(w for name in EXPORTS for w in ("--to", name)), "--out", here / "exports"),
+    )
+    assert [d.err for d in done if d.code] == []
+    assert "CHOSEN" in done[0].out
+    (here / "exported").write_text(done[-1].out)
+    return here
 
 
 @pytest.fixture
-def written(done: tuple[Path, dict[str, Done]]) -> Callable[[str, str], Path]:
-    """Path of a file that the command of this name has written."""
-
-    def path(name: str, file: str) -> Path:
-        assert done[1][name].code == 0, done[1][name].err
-        return done[0] / file
-
-    return path
-
-
-@pytest.fixture
-def detected(done: tuple[Path, dict[str, Done]], written: Callable[[str, str], Path]) -> Path:
-    assert "CHOSEN" in done[1]["keypoints"].out
-    return written("keypoints", "walking.keypoints.npz")
-
-
-@pytest.fixture
-def fitted(written: Callable[[str, str], Path]) -> Path:
-    return written("fit", "new folder/walking.fit.npz")
+def fitted(here: Path) -> Path:
+    return here / "new folder" / "walking.fit.npz"
 
 
 def section(title: str) -> str:
@@ -95,7 +77,8 @@ def check_fields(path: Path, title: str, sizes: dict[str, int], optional: tuple[
     return set(data) - set(fields)
 
 
-def test_keypoints_are_as_described(detected):
+def test_keypoints_are_as_described(here):
+    detected = here / "walking.keypoints.npz"
     sizes = {"T": 90, "J": 33}
     optional = ("phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s", "xyz_world_m", "origin")
     undocumented = check_fields(detected, "<name>.keypoints.npz", sizes, optional)
@@ -166,8 +149,8 @@ def test_session_json_is_as_described(fitted):
     assert all({"check", "outcome", "value", "threshold", "advice"} <= set(c) for c in content["qc"])
 
 
-def test_events_of_the_fit_are_as_described(written):
-    header, *rows = written("events", "made/walking.events.csv").read_text().splitlines()
+def test_events_of_the_fit_are_as_described(here):
+    header, *rows = (here / "made" / "walking.events.csv").read_text().splitlines()
     assert re.search(r"`time_s, side \(left\|right\), event \(foot_down\|foot_up\), probability`", DOCS.read_text())
     assert header == "time_s,side,event,probability"
     downs = [r.split(",") for r in rows if ",foot_down," in r]
@@ -177,12 +160,12 @@ def test_events_of_the_fit_are_as_described(written):
     assert all(r[1] in ("left", "right") and 0 <= float(r[3]) <= 1 for r in downs)
 
 
-def test_events_of_the_keypoints_too(written):
-    assert written("e", "e.csv").read_text().count("foot_down") in (4, 5)
+def test_events_of_the_keypoints_too(here):
+    assert (here / "e.csv").read_text().count("foot_down") in (4, 5)
 
 
-def test_metrics_are_as_described(written):
-    content = json.loads(written("metrics", "metrics.json").read_text())
+def test_metrics_are_as_described(here):
+    content = json.loads((here / "metrics.json").read_text())
     measures = re.findall(r"`(\w+_(?:per_min|s|percent|per_s|m))`", section("metrics.json"))[:14]
     assert measures == list(MEASURES)
     for part in (content["session"], *content["trials"]):
@@ -198,11 +181,10 @@ def test_metrics_are_as_described(written):
     assert content["session"]["cadence_steps_per_min"]["mean"] == pytest.approx(98, rel=0.06)
 
 
-def test_the_fit_is_exported(done, written):
-    out = written("exports", "exports")
-    paths = [Path(line) for line in done[1]["exports"].out.splitlines()]
+def test_the_fit_is_exported(here):
+    paths = [Path(line) for line in (here / "exported").read_text().splitlines()]
     assert {f".{name}" for name in EXPORTS} <= {path.suffix for path in paths}
-    assert all(path.is_relative_to(out) and path.stat().st_size for path in paths)
+    assert all(path.is_relative_to(here / "exports") and path.stat().st_size for path in paths)
 
 
 @pytest.mark.long

@@ -99,21 +99,16 @@ class Home:
         if name in self.built:
             put_back(self.path, name)
             return self.built[name]
-        if build not in BASES:
-            self.empty()
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            cursor.execute("SET foreign_key_checks = 0")
+            cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
+            for (schema,) in cursor.fetchall() if build not in BASES else ():
+                cursor.execute(f"DROP DATABASE {schema}")
         result = build(self.path)
         if not mysql.chosen():
             self.built[name] = result
             keep(self.path, name)
         return result
-
-    def empty(self) -> None:
-        """Drop all schemas."""
-        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-            cursor.execute("SET foreign_key_checks = 0")
-            cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
-            for (schema,) in cursor.fetchall():
-                cursor.execute(f"DROP DATABASE {schema}")
 
 
 @pytest.fixture(scope="module")
@@ -194,18 +189,7 @@ def without_session(folder: Path) -> dict[str, list[tuple]]:
 def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     """Take the migrations from 0006 back."""
     rows = everything()
-    _undo(
-        older_tables.undo_0016,
-        older_tables.undo_0015,
-        older_tables.undo_0014,
-        older_tables.undo_0013,
-        older_tables.undo_0012,
-        older_tables.undo_0010,
-        older_tables.undo_0009,
-        older_tables.undo_0008,
-        older_tables.undo_0007,
-        older_tables.undo_0006,
-    )
+    _undo(*(getattr(older_tables, f"undo_{n:04}") for n in (16, 15, 14, 13, 12, 10, 9, 8, 7, 6)))
     return rows
 
 
