@@ -46,7 +46,6 @@ def check(python: str) -> list[str]:
     _run(sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(FOLDER))
     (wheel,) = FOLDER.glob("*.whl")
     program = FOLDER / "env" / "bin" / "python"
-    # Compiling all modules takes longer than the few that are loaded take then.
     install = [str(program), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
     with subprocess.Popen(_demo(Path(sys.executable)), cwd=FOLDER, env=_environment()) as of_this:  # while pip works
         _run(python, "-m", "venv", str(FOLDER / "env"))

@@ -9,6 +9,7 @@ cannot be removed while they are open, and whether the dependencies work there.
 from __future__ import annotations
 
 import builtins
+import contextlib
 import io
 import json
 import os
@@ -70,16 +71,17 @@ def main() -> None:
     ends, calls = [], json.loads(sys.argv[1])
     for sys.argv[1:] in calls:
         files = io.BytesIO(), io.BytesIO()
-        sys.stdout, sys.stderr = (io.TextIOWrapper(f, ENCODING, "strict", write_through=True) for f in files)
-        try:
-            pbl_main()
-        except SystemExit as end:
-            ends.append([end.code or 0, *(f.getvalue().decode(ENCODING) for f in files)])
-    sys.__stdout__.write(json.dumps(ends))
+        out, err = (io.TextIOWrapper(f, ENCODING, "strict", write_through=True) for f in files)
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                pbl_main()
+            except SystemExit as end:
+                ends.append([end.code or 0, *(f.getvalue().decode(ENCODING) for f in files)])
+    sys.stdout.write(json.dumps(ends))
 
 
 def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> list[Done]:
-    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, with these variables, too.
+    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, in which these variables are set.
 
     `packages` is the folder that the project's packages are imported from: this checkout, or an installed wheel.
     """

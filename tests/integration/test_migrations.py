@@ -159,14 +159,17 @@ def new(folder: Path) -> None:
     pbl_schemas.activate()
 
 
-def one_visit(folder: Path) -> None:
+def one_visit(folder: Path, day: str = "2026-03-01") -> dict[str, list[tuple]]:
     """Compute a visit."""
-    _visits(folder, "2026-03-01")
+    pbl_schemas.activate()
+    register(chain.small_video(folder, day), session_label=day)
+    _compute()
+    return everything()
 
 
 def two_visits(folder: Path) -> None:
     """Compute another one."""
-    _visits(folder, "2026-06-01")
+    one_visit(folder, "2026-06-01")
 
 
 def without_sizes(folder: Path) -> None:
@@ -237,7 +240,7 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
 
 def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     """Freeze three visits, about two of which something was stated in words, and take migration 0011 back."""
-    rows = _visits(folder, "2026-09-01")
+    rows = one_visit(folder, "2026-09-01")
     for number, aid in enumerate(("Keine", "Gehstock", "my own"), 1):
         study.Visit.insert1({"session_id": number, "visit_role": "pre", "assistive_device": aid})
     slices.freeze("of words")
@@ -246,20 +249,10 @@ def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     return rows
 
 
-#: What a builder is given, where that is no empty database.
-BASES: dict[Callable[[Path], Any], Callable[[Path], Any]] = {
-    without_instruments: new,
-    one_visit: new,
-    **dict.fromkeys((two_visits, without_sizes, corrected_by_a_method), one_visit),
-    **dict.fromkeys((without_session, tracked_without_video_info, stated_in_words), two_visits),
-}
-
-
-def _visits(folder: Path, day: str) -> dict[str, list[tuple]]:
-    pbl_schemas.activate()
-    register(chain.small_video(folder, day), session_label=day)
-    _compute()
-    return everything()
+#: What a builder begins with, if not an empty database.
+BASES: dict[Callable[[Path], Any], Callable[[Path], Any]] = {without_instruments: new, one_visit: new}
+BASES |= dict.fromkeys((two_visits, without_sizes, corrected_by_a_method), one_visit)
+BASES |= dict.fromkeys((without_session, tracked_without_video_info, stated_in_words), two_visits)
 
 
 def _compute() -> None:
@@ -409,12 +402,8 @@ def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
     add += " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 7, 'any', %s, NOW(3),"
     add += " NOW(3) - INTERVAL %s SECOND, NULL, '')"
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        for name, version, ago in (
-            ("a" * 16, "0.1.0", 5),
-            ("b" * 16, code_version()[:64], 5),
-            ("c" * 16, "0.1.0", 500),
-        ):
-            cursor.execute(add, (name, f"host-{name[0]}", version, ago))
+        for name, version, ago in (("a", "0.1.0", 5), ("b", code_version()[:64], 5), ("c", "0.1.0", 500)):
+            cursor.execute(add, (name * 16, f"host-{name}", version, ago))
     dry = pbl("db", "migrate", "--dry-run")
     assert [line for line in dry.out.splitlines() if "running" in line] == [
         "  still running: process 7 on host-a, pbl-pipeline 0.1.0"
@@ -534,13 +523,8 @@ def test_what_no_migration_removes_is_named(put: Put, add: Callable[[str, str], 
         cursor.execute("ALTER TABLE pbl_session.session ADD COLUMN forgotten INT NOT NULL")
         cursor.execute("ALTER TABLE pbl_keypoints.__keypoints DROP INDEX camera_kind")
     named = _named()
-    assert {n.split(":")[0] for n in named} == {
-        "`pbl_video`.`video`",
-        "`pbl_lab`.`subject`",
-        "`pbl_lab`.`project`",
-        "`pbl_session`.`session`",
-        "`pbl_keypoints`.`__keypoints`",
-    }
+    altered = ("video`.`video", "lab`.`subject", "lab`.`project", "session`.`session", "keypoints`.`__keypoints")
+    assert {n.split(":")[0] for n in named} == {f"`pbl_{t}`" for t in altered}
     for part in ("ADD `video_size` bigint", "MODIFY `subject_height` double", "varchar(200)", "`forgotten`", "indexes"):
         assert any(part in n for n in named), part
     # Refused before the first statement, also of a migration that could be applied; one difference a line.
@@ -601,11 +585,8 @@ def test_a_database_of_a_newer_version_is_left_alone(
     put(new)
     assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute(
-            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied)"
-            " VALUES (%s, %s, '9.9+gabc', NOW())",
-            (number, name),
-        )
+        insert = "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied) VALUES (%s, %s, %s, NOW())"
+        cursor.execute(insert, (number, name, "9.9+gabc"))
     before = everything()
     for command in STARTS:
         forget()
