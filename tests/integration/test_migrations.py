@@ -419,10 +419,8 @@ def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
 def columns_of(schema: str, table: str) -> set[str]:
     """Columns of a table on the server."""
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute(
-            "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
-            (schema, table),
-        )
+        asked = "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s"
+        cursor.execute(asked, (schema, table))
         return {str(row[0]) for row in cursor.fetchall()}
 
 
