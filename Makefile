@@ -91,13 +91,14 @@ $(RUNS): pyproject.toml $(IMAGE)
 	@test ! -x $(BIN)/python || $(BIN)/python $(FITS)
 	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv $(VENV)
 	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $(IMAGE)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r $(IMAGE)
+	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true # pip compiles on one core
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@touch $(RUNS)
 
 $(READY): $(RUNS) requirements.lock
 	@echo "installing what the tests need"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.lock
 	@touch $(READY)
 
 clean:          ## remove the virtual environment and the demo's output; the database and the cache stay

@@ -46,7 +46,7 @@ def check(python: str) -> list[str]:
     _run(sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(FOLDER))
     (wheel,) = FOLDER.glob("*.whl")
     program = FOLDER / "env" / "bin" / "python"
-    install = [str(program), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    install = [str(program), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
     with subprocess.Popen(_demo(Path(sys.executable)), cwd=FOLDER, env=_environment()) as of_this:  # while pip works
         _run(python, "-m", "venv", str(FOLDER / "env"))
         _run(*install, str(wheel))
@@ -73,7 +73,7 @@ def _demo(program: Path) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    return {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
 
 
 def _measures(out: Path) -> dict[str, Any]:

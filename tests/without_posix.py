@@ -9,12 +9,14 @@ cannot be removed while they are open, and whether the dependencies work there.
 from __future__ import annotations
 
 import builtins
+import contextlib
 import io
+import json
 import os
 import subprocess
 import sys
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,27 +64,39 @@ def install() -> None:
 
 
 def main() -> None:
-    """`pbl` with the arguments of this process."""
+    """Calls of `pbl`, one after the other; their arguments come as JSON, and their ends go as JSON."""
     install()
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(encoding=ENCODING, errors="strict")
     from pbl_pipeline.cli import main as pbl_main
 
-    pbl_main()
+    ends, calls = [], json.loads(sys.argv[1])
+    for sys.argv[1:] in calls:
+        files = io.BytesIO(), io.BytesIO()
+        out, err = (io.TextIOWrapper(f, ENCODING, "strict", write_through=True) for f in files)
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                pbl_main()
+            except SystemExit as end:
+                ends.append([end.code or 0, *(f.getvalue().decode(ENCODING) for f in files)])
+    sys.stdout.write(json.dumps(ends))
 
 
-def pbl(*arguments: object, packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> Done:
-    """Run `pbl --quiet ARGUMENTS` in a process of its own without POSIX, with these environment variables, too.
+def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str, str] | None = None) -> list[Done]:
+    """Run `pbl --quiet` with the arguments of each call in one process without POSIX, in which these variables are set.
 
     `packages` is the folder that the project's packages are imported from: this checkout, or an installed wheel.
     """
     from tests.command import Done
 
-    words = [sys.executable, "-P", __file__, "--quiet", *map(str, arguments)]
+    words = [sys.executable, "-P", __file__, json.dumps([["--quiet", *map(str, call)] for call in calls])]
     env = {**os.environ, "PYTHONPATH": str(packages), **(variables or {})}
     done = subprocess.run(words, capture_output=True, env=env, timeout=300, check=False)
-    return Done(done.returncode, done.stdout.decode(ENCODING), done.stderr.decode(ENCODING))
+    assert done.returncode == 0, done.stderr.decode()
+    return [Done(*end) for end in json.loads(done.stdout)]
+
+
+def pbl(*arguments: object, **options: Any) -> Done:
+    """`each` of one call."""
+    return each(arguments, **options)[0]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The commands on files, one after the other on a short clip, and their files against docs/files.md.
 
-In processes that find nothing of POSIX (tests/without_posix.py): what they write is what other systems would get."""
+In a process that finds nothing of POSIX (tests/without_posix.py): what they write is what other systems would get."""
 
 import csv
 import json
@@ -12,28 +12,36 @@ import pytest
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.gait import MEASURES
-from tests.without_posix import ENCODING, pbl
+from tests.without_posix import ENCODING, each, pbl
 
 pytestmark = pytest.mark.slow
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "files.md"
+EXPORTS = ("trc", "mot", "osim", "csv")
 
 
 @pytest.fixture(scope="module")
-def detected(walking: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("files") / "walking.keypoints.npz"
-    done = pbl("detect", walking, "--out", path)
-    assert done.code == 0, done.err
-    assert "CHOSEN" in done.out
-    return path
+def here(walking: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the commands wrote, and what the last one printed."""
+    here = tmp_path_factory.mktemp("files")
+    keypoints, out, fit = here / "walking.keypoints.npz", here / "new folder", here / "new folder" / "walking.fit.npz"
+    done = each(
+        ("detect", walking, "--out", keypoints),
+        ("fit", keypoints, "--out", out),
+        ("events", fit, "--out", here / "made" / "walking.events.csv"),
+        ("events", keypoints, "--out", here / "e.csv"),
+        ("gait", fit, "--out", here / "metrics.json"),
+        ("export", fit, *(w for name in EXPORTS for w in ("--to", name)), "--out", here / "exports"),
+    )
+    assert [d.err for d in done if d.code] == []
+    assert "CHOSEN" in done[0].out
+    (here / "exported").write_text(done[-1].out)
+    return here
 
 
-@pytest.fixture(scope="module")
-def fitted(detected: Path) -> Path:
-    out = detected.parent / "new folder"
-    done = pbl("fit", detected, "--out", out)
-    assert done.code == 0, done.err
-    return out / "walking.fit.npz"
+@pytest.fixture
+def fitted(here: Path) -> Path:
+    return here / "new folder" / "walking.fit.npz"
 
 
 def section(title: str) -> str:
@@ -69,7 +77,8 @@ def check_fields(path: Path, title: str, sizes: dict[str, int], optional: tuple[
     return set(data) - set(fields)
 
 
-def test_keypoints_are_as_described(detected):
+def test_keypoints_are_as_described(here):
+    detected = here / "walking.keypoints.npz"
     sizes = {"T": 90, "J": 33}
     optional = ("phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s", "xyz_world_m", "origin")
     undocumented = check_fields(detected, "<name>.keypoints.npz", sizes, optional)
@@ -140,11 +149,8 @@ def test_session_json_is_as_described(fitted):
     assert all({"check", "outcome", "value", "threshold", "advice"} <= set(c) for c in content["qc"])
 
 
-def test_events_of_the_fit_are_as_described(fitted, tmp_path):
-    path = tmp_path / "made" / "walking.events.csv"
-    done = pbl("events", fitted, "--out", path)
-    assert done.code == 0, done.err
-    header, *rows = path.read_text().splitlines()
+def test_events_of_the_fit_are_as_described(here):
+    header, *rows = (here / "made" / "walking.events.csv").read_text().splitlines()
     assert re.search(r"`time_s, side \(left\|right\), event \(foot_down\|foot_up\), probability`", DOCS.read_text())
     assert header == "time_s,side,event,probability"
     downs = [r.split(",") for r in rows if ",foot_down," in r]
@@ -154,16 +160,12 @@ def test_events_of_the_fit_are_as_described(fitted, tmp_path):
     assert all(r[1] in ("left", "right") and 0 <= float(r[3]) <= 1 for r in downs)
 
 
-def test_events_of_the_keypoints_too(detected, tmp_path):
-    done = pbl("events", detected, "--out", tmp_path / "e.csv")
-    assert done.code == 0, done.err
-    assert (tmp_path / "e.csv").read_text().count("foot_down") in (4, 5)
+def test_events_of_the_keypoints_too(here):
+    assert (here / "e.csv").read_text().count("foot_down") in (4, 5)
 
 
-def test_metrics_are_as_described(fitted, tmp_path):
-    done = pbl("gait", fitted, "--out", tmp_path / "metrics.json")
-    assert done.code == 0, done.err
-    content = json.loads((tmp_path / "metrics.json").read_text())
+def test_metrics_are_as_described(here):
+    content = json.loads((here / "metrics.json").read_text())
     measures = re.findall(r"`(\w+_(?:per_min|s|percent|per_s|m))`", section("metrics.json"))[:14]
     assert measures == list(MEASURES)
     for part in (content["session"], *content["trials"]):
@@ -179,14 +181,10 @@ def test_metrics_are_as_described(fitted, tmp_path):
     assert content["session"]["cadence_steps_per_min"]["mean"] == pytest.approx(98, rel=0.06)
 
 
-def test_the_fit_is_exported(fitted, tmp_path):
-    out = tmp_path / "exports"
-    formats = ("trc", "mot", "osim", "csv")
-    done = pbl("export", fitted, *(word for name in formats for word in ("--to", name)), "--out", out)
-    assert done.code == 0, done.err
-    written = [Path(line) for line in done.out.splitlines()]
-    assert {f".{name}" for name in formats} <= {path.suffix for path in written}
-    assert all(path.is_relative_to(out) and path.stat().st_size for path in written)
+def test_the_fit_is_exported(here):
+    paths = [Path(line) for line in (here / "exported").read_text().splitlines()]
+    assert {f".{name}" for name in EXPORTS} <= {path.suffix for path in paths}
+    assert all(path.is_relative_to(here / "exports") and path.stat().st_size for path in paths)
 
 
 @pytest.mark.long

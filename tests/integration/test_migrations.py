@@ -90,7 +90,8 @@ class Home:
         self.built: dict[str, Any] = {}
 
     def put(self, build: Callable[[Path], Any]) -> Any:
-        """Make the database what `build` makes of an empty one, given a folder for videos; return what it returns.
+        """Make the database what `build` makes of an empty one, or of its base, which is there, given a folder for
+        videos; return what it returns.
 
         It is built once; after that its files are put back. On MySQL it is built each time.
         """
@@ -101,7 +102,7 @@ class Home:
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             cursor.execute("SET foreign_key_checks = 0")
             cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
-            for (schema,) in cursor.fetchall():
+            for (schema,) in cursor.fetchall() if build not in BASES else ():
                 cursor.execute(f"DROP DATABASE {schema}")
         result = build(self.path)
         if not mysql.chosen():
@@ -139,6 +140,8 @@ def put(home: Home, forget: Callable[[], None]) -> Put:
     """`Home.put`, in a process that knows nothing of the database before and after."""
 
     def done(build: Callable[[Path], Any]) -> Any:
+        if build in BASES and build.__name__ not in home.built:
+            done(BASES[build])
         forget()
         result = home.put(build)
         forget()
@@ -156,9 +159,21 @@ def new(folder: Path) -> None:
     pbl_schemas.activate()
 
 
+def one_visit(folder: Path, day: str = "2026-03-01") -> dict[str, list[tuple]]:
+    """Compute a visit."""
+    pbl_schemas.activate()
+    register(chain.small_video(folder, day), session_label=day)
+    _compute()
+    return everything()
+
+
+def two_visits(folder: Path) -> None:
+    """Compute another one."""
+    one_visit(folder, "2026-06-01")
+
+
 def without_sizes(folder: Path) -> None:
-    """Compute a visit in tables from before videos had a size and before there was a schema for validation."""
-    _visits(folder, "2026-03-01")
+    """A visit in tables from before videos had a size and before there was a schema for validation."""
 
     def undo_sizes(cursor: Any) -> None:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
@@ -168,35 +183,22 @@ def without_sizes(folder: Path) -> None:
 
 
 def without_session(folder: Path) -> dict[str, list[tuple]]:
-    """Compute two visits and take migration 0001 back; return the rows of before that, as all builders below."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    """Take migration 0001 back; return the rows of before that, as all builders below."""
+    rows = everything()
     _undo(older_tables.undo_0001)
     return rows
 
 
 def without_instruments(folder: Path) -> dict[str, list[tuple]]:
-    """Declare the tables and take the migrations from 0006 back."""
-    pbl_schemas.activate()
+    """Take the migrations from 0006 back."""
     rows = everything()
-    _undo(
-        older_tables.undo_0017,
-        older_tables.undo_0016,
-        older_tables.undo_0015,
-        older_tables.undo_0014,
-        older_tables.undo_0013,
-        older_tables.undo_0012,
-        older_tables.undo_0010,
-        older_tables.undo_0009,
-        older_tables.undo_0008,
-        older_tables.undo_0007,
-        older_tables.undo_0006,
-    )
+    _undo(*(getattr(older_tables, f"undo_{n:04}") for n in (17, 16, 15, 14, 13, 12, 10, 9, 8, 7, 6)))
     return rows
 
 
 def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
-    """Compute a visit whose events are corrected, and take migration 0004 back."""
-    _visits(folder, "2026-03-01")
+    """Correct the events of the visit, and take migration 0004 back."""
+    pbl_schemas.activate()
     found = not_none(event_corrections.shown_events(1))
     (time, side, kind, _), *others = found.events
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
@@ -228,8 +230,8 @@ def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
 
 
 def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
-    """Compute two visits and take migration 0005 back, for the first one."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    """Take migration 0005 back, for the first visit."""
+    rows = everything()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         older_tables.undo_0005(cursor, 1)
         cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
@@ -238,7 +240,7 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
 
 def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     """Freeze three visits, about two of which something was stated in words, and take migration 0011 back."""
-    rows = _visits(folder, "2026-03-01", "2026-06-01", "2026-09-01")
+    rows = one_visit(folder, "2026-09-01")
     for number, aid in enumerate(("Keine", "Gehstock", "my own"), 1):
         study.Visit.insert1({"session_id": number, "visit_role": "pre", "assistive_device": aid})
     slices.freeze("of words")
@@ -247,12 +249,10 @@ def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     return rows
 
 
-def _visits(folder: Path, *days: str) -> dict[str, list[tuple]]:
-    pbl_schemas.activate()
-    for day in days:
-        register(chain.small_video(folder, day), session_label=day)
-    _compute()
-    return everything()
+#: What a builder begins with, if not an empty database.
+BASES: dict[Callable[[Path], Any], Callable[[Path], Any]] = {without_instruments: new, one_visit: new}
+BASES |= dict.fromkeys((two_visits, without_sizes, corrected_by_a_method), one_visit)
+BASES |= dict.fromkeys((without_session, tracked_without_video_info, stated_in_words), two_visits)
 
 
 def _compute() -> None:
@@ -402,12 +402,8 @@ def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
     add += " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 7, 'any', %s, NOW(3),"
     add += " NOW(3) - INTERVAL %s SECOND, NULL, '')"
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        for name, version, ago in (
-            ("a" * 16, "0.1.0", 5),
-            ("b" * 16, code_version()[:64], 5),
-            ("c" * 16, "0.1.0", 500),
-        ):
-            cursor.execute(add, (name, f"host-{name[0]}", version, ago))
+        for name, version, ago in (("a", "0.1.0", 5), ("b", code_version()[:64], 5), ("c", "0.1.0", 500)):
+            cursor.execute(add, (name * 16, f"host-{name}", version, ago))
     dry = pbl("db", "migrate", "--dry-run")
     assert [line for line in dry.out.splitlines() if "running" in line] == [
         "  still running: process 7 on host-a, pbl-pipeline 0.1.0"
@@ -423,10 +419,8 @@ def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
 def columns_of(schema: str, table: str) -> set[str]:
     """Columns of a table on the server."""
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute(
-            "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
-            (schema, table),
-        )
+        asked = "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s"
+        cursor.execute(asked, (schema, table))
         return {str(row[0]) for row in cursor.fetchall()}
 
 
@@ -527,13 +521,8 @@ def test_what_no_migration_removes_is_named(put: Put, add: Callable[[str, str], 
         cursor.execute("ALTER TABLE pbl_session.session ADD COLUMN forgotten INT NOT NULL")
         cursor.execute("ALTER TABLE pbl_keypoints.__keypoints DROP INDEX camera_kind")
     named = _named()
-    assert {n.split(":")[0] for n in named} == {
-        "`pbl_video`.`video`",
-        "`pbl_lab`.`subject`",
-        "`pbl_lab`.`project`",
-        "`pbl_session`.`session`",
-        "`pbl_keypoints`.`__keypoints`",
-    }
+    altered = ("video`.`video", "lab`.`subject", "lab`.`project", "session`.`session", "keypoints`.`__keypoints")
+    assert {n.split(":")[0] for n in named} == {f"`pbl_{t}`" for t in altered}
     for part in ("ADD `video_size` bigint", "MODIFY `subject_height` double", "varchar(200)", "`forgotten`", "indexes"):
         assert any(part in n for n in named), part
     # Refused before the first statement, also of a migration that could be applied; one difference a line.
@@ -594,11 +583,8 @@ def test_a_database_of_a_newer_version_is_left_alone(
     put(new)
     assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute(
-            "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied)"
-            " VALUES (%s, %s, '9.9+gabc', NOW())",
-            (number, name),
-        )
+        insert = "INSERT INTO pbl_lab.`~migrations` (number, name, code_version, applied) VALUES (%s, %s, %s, NOW())"
+        cursor.execute(insert, (number, name, "9.9+gabc"))
     before = everything()
     for command in STARTS:
         forget()
