@@ -8,6 +8,7 @@ above the hips along the body's axis.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +61,14 @@ class BlazePoseDetector:
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         """Find people in `image` (H, W, 3) uint8 BGR, best first. Boxes may reach beyond the picture."""
-        detections = []
-        # After the corners of the box: the middle of the hips and the point on the circle.
-        for points, score in zip(*self._model.find(image), strict=True):
-            roi = circle_roi(points[2], points[3])
-            detections.append(Detection(box_px=body_box(roi), score=float(score), roi_px=roi))
-        return detections
+        return next(self.detect_all([image]))
+
+    def detect_all(self, images: Sequence[np.ndarray]) -> Iterator[list[Detection]]:
+        """`detect` of each picture, side by side on a GPU."""
+        for points, scores in self._model.find_all(images):
+            # After the corners of the box: the middle of the hips and the point on the circle.
+            rois = [circle_roi(*p[2:4]) for p in points]
+            yield [Detection(body_box(roi), float(score), roi) for roi, score in zip(rois, scores, strict=True)]
 
 
 class BlazePoseWindows(BlazePoseDetector):
