@@ -6,7 +6,6 @@ GHUM Holistic" for the metric points, and the graph configuration beside the mod
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -22,7 +21,7 @@ from pbl_pipeline.video import Camera, cut_image
 
 from .flips import mirror_of
 from .mirrored_inference import MirroredInference
-from .protocol import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, Inspection, KeypointParams
+from .protocol import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
 from .types import PersonKeypoints
 from .virtual_camera import crop_matrix, view_rotation
 
@@ -139,51 +138,42 @@ class BlazePoseLandmarks:
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False
     ) -> PersonKeypoints:
         """See `CropDetector`."""
-        return self.begin(crop, roi_px, camera, Inspection.QUICK if quick else Inspection.FULL)()
+        if quick:
+            return self._look(self._quick, crop, roi_px, camera, mirrored=False)
+        own, other = (self.detect_once(crop, roi_px, camera, mirrored=m) for m in (False, True))
+        return self.mirrored_inference.averaged(own, other)
 
     def detect_once(
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False
     ) -> PersonKeypoints:
         """See `MirrorDetector`."""
-        return self.begin(crop, roi_px, camera, Inspection.MIRRORED if mirrored else Inspection.PLAIN)()
+        return self._look(self._model, crop, roi_px, camera, mirrored=mirrored)
 
-    def begin(
-        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, inspection: Inspection
-    ) -> Callable[[], PersonKeypoints]:
-        """See `SharedDetector`."""
-        if inspection is Inspection.FULL:
-            own, other = (self.begin(crop, roi_px, camera, i) for i in (Inspection.PLAIN, Inspection.MIRRORED))
-            return lambda: self.mirrored_inference.averaged(own(), other())
-        network, mirrored = (
-            self._quick if inspection is Inspection.QUICK else self._model,
-            inspection is Inspection.MIRRORED,
-        )
+    def _look(
+        self, network: Network, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
+    ) -> PersonKeypoints:
+        """Return the points that a network finds in the crop, or in its mirror image, in coordinates of the picture."""
         crop = cv2.cvtColor(crop, cv2.COLOR_BGR2RGB)
-        output = network.begin(cv2.flip(crop, 1) if mirrored else crop)
-        return lambda: _points(output(), roi_px, camera, mirrored=mirrored)
-
-
-def _points(output: dict[int, np.ndarray], roi_px: np.ndarray, camera: Camera, *, mirrored: bool) -> PersonKeypoints:
-    """Points that a network found in the crop, or in its mirror image, in coordinates of the picture."""
-    found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
-    points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]
-    world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
-    confidence = expit(logits[:, 0]) * expit(logits[:, 1])
-    if mirrored:
-        flip, edge = np.array([-1.0, 1.0]), np.array([float(INPUT_SIZE), 0.0])
-        points, circle = points[MIRROR] * flip + edge, circle * flip + edge
-        world, confidence = world[MIRROR] * np.array([-1.0, 1.0, 1.0]), confidence[MIRROR]
-    roi = _with_margin(roi_px)
-    to_picture = crop_matrix(roi, INPUT_SIZE)
-    circle_px = circle @ to_picture[:, :2].T + to_picture[:, 2]
-    return PersonKeypoints(
-        xy_px=points @ to_picture[:, :2].T + to_picture[:, 2],
-        xyz_cam_m=world @ view_rotation(roi, camera).T,
-        confidence=confidence,
-        presence=float(output[1].item()),
-        roi_px=circle_roi(*circle_px),
-        crop_px=float(roi[2]),
-    )
+        output = network(cv2.flip(crop, 1) if mirrored else crop)
+        found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
+        points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]
+        world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)
+        confidence = expit(logits[:, 0]) * expit(logits[:, 1])
+        if mirrored:
+            flip, edge = np.array([-1.0, 1.0]), np.array([float(INPUT_SIZE), 0.0])
+            points, circle = points[MIRROR] * flip + edge, circle * flip + edge
+            world, confidence = world[MIRROR] * np.array([-1.0, 1.0, 1.0]), confidence[MIRROR]
+        roi = _with_margin(roi_px)
+        to_picture = crop_matrix(roi, INPUT_SIZE)
+        circle_px = circle @ to_picture[:, :2].T + to_picture[:, 2]
+        return PersonKeypoints(
+            xy_px=points @ to_picture[:, :2].T + to_picture[:, 2],
+            xyz_cam_m=world @ view_rotation(roi, camera).T,
+            confidence=confidence,
+            presence=float(output[1].item()),
+            roi_px=circle_roi(*circle_px),
+            crop_px=float(roi[2]),
+        )
 
 
 def _with_margin(roi_px: np.ndarray) -> np.ndarray:

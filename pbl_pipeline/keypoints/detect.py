@@ -8,7 +8,6 @@ drift to another person: if the first pass contradicts the track, the track is u
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,9 +25,9 @@ from pbl_pipeline.video import Camera, Frame, read_frames
 from .crops import Regions, smooth_rois
 from .flips import exchange_sides, exchanged, lowered
 from .methods import METHODS
-from .passes import BatchDetector, BatchedInference, ParallelInference, SharedInference, two_passes
+from .passes import BatchDetector, BatchedInference, ParallelInference, two_passes
 from .picture import Picture, PictureMeter
-from .protocol import Inspection, KeypointDetector, KeypointParams, MirrorDetector, SharedDetector
+from .protocol import Inspection, KeypointDetector, KeypointParams, MirrorDetector
 from .quality_checks import confidence_curve
 from .types import Keypoints, PersonKeypoints
 
@@ -92,15 +91,14 @@ def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
-    """Return the detector of the method, or one for each core if it states that this is fastest."""
+    """Return the detector of the method, or one for each core if it states that this is fastest. One on a GPU is
+    repeated: as many threads as it asks for share it."""
     first = method.function(method.params)
-    more = min(cores(), MAX_DETECTORS) - 1 if getattr(first, "per_core", False) and not _is_shared(first) else 0
+    shared = getattr(first, "side_by_side", 1)
+    if shared > 1:
+        return [first] * shared
+    more = min(cores(), MAX_DETECTORS) - 1 if getattr(first, "per_core", False) else 0
     return [first, *(method.function(method.params) for _ in range(more))]
-
-
-def _is_shared(detector: KeypointDetector) -> bool:
-    """True for a detector on a GPU, of which several inferences are under way."""
-    return isinstance(detector, SharedDetector) and detector.side_by_side > 1
 
 
 def _detect_all(
@@ -117,19 +115,14 @@ def _detect_all(
     found: list[PersonKeypoints | None] = [None] * len(roi)
     frames = meter.watch(_in_view(video_path, regions.rows), roi)
     one = detectors[0]
+    batched = isinstance(one, BatchDetector)
     sharing = one if isinstance(one, MirrorDetector) and _close(time_s[regions.rows], params.share_looks_s) else None
     mirrored = np.arange(len(roi)) % 2 == 1
 
     def inspection(row: int) -> Inspection:
         return Inspection.FULL if sharing is None else Inspection.MIRRORED if mirrored[row] else Inspection.PLAIN
 
-    with contextlib.ExitStack() as stack:
-        if isinstance(one, BatchDetector):
-            inference = stack.enter_context(BatchedInference(one, camera))
-        elif isinstance(one, SharedDetector) and _is_shared(one):
-            inference = stack.enter_context(SharedInference(one, camera))
-        else:
-            inference = stack.enter_context(ParallelInference(detectors, camera))
+    with BatchedInference(one, camera) if batched else ParallelInference(detectors, camera) as inference:
         seen = two_passes(frames, inference, time_s, regions, inspection)
         for row, person in progress.track(seen, "keypoints", total=len(regions.rows)):
             found[row] = person

@@ -9,7 +9,6 @@ several.
 from __future__ import annotations
 
 import collections
-import functools
 import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,7 +20,7 @@ import numpy as np
 from pbl_pipeline.video import Camera, Frame
 
 from .crops import Regions
-from .protocol import CropDetector, Inspection, KeypointDetector, MirrorDetector, SharedDetector
+from .protocol import CropDetector, Inspection, KeypointDetector, MirrorDetector
 from .types import PersonKeypoints
 
 _Item = tuple[Frame, np.ndarray, bool, "Future[PersonKeypoints]"]
@@ -98,19 +97,12 @@ class BatchedInference:
             item[3].set_result(person)
 
 
-class Result(Protocol):
-    """What will be the result of an inference."""
-
-    def result(self) -> PersonKeypoints: ...
-
-
 class Inference(Protocol):
-    """Runs detectors: `ParallelInference`, `BatchedInference` for a detector of many frames at once, `SharedInference`
-    for one on a GPU."""
+    """Runs detectors: `ParallelInference`, or `BatchedInference` for a detector of many frames at once."""
 
     n_detectors: int
 
-    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> Result: ...
+    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> Future[PersonKeypoints]: ...
 
 
 class ParallelInference:
@@ -149,39 +141,6 @@ class ParallelInference:
             self._idle.put(detector)
 
 
-class _Begun:
-    """An inference that is under way."""
-
-    def __init__(self, wait: Callable[[], PersonKeypoints]) -> None:
-        self.result = functools.cache(wait)
-
-
-class SharedInference:
-    """One detector in the thread that submits, with as many inferences under way as use its device fully."""
-
-    def __init__(self, detector: SharedDetector, camera: Camera) -> None:
-        self._detector, self._camera = detector, camera
-        self._under_way: collections.deque[_Begun] = collections.deque()
-        self.n_detectors = detector.side_by_side
-
-    def __enter__(self) -> SharedInference:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for begun in self._under_way:  # their places in the shared memory are free for the next video then
-            begun.result()
-
-    def submit(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> _Begun:
-        """Begin to detect in the region `roi_px` (4,) of a frame."""
-        # In full it is inspected twice.
-        while len(self._under_way) > self.n_detectors - (2 if inspection is Inspection.FULL else 1):
-            self._under_way.popleft().result()
-        crop = frame.cut(*self._detector.crop_of(roi_px))
-        begun = _Begun(self._detector.begin(crop, roi_px, self._camera, inspection))
-        self._under_way += [begun] * (2 if inspection is Inspection.FULL else 1)
-        return begun
-
-
 def two_passes(
     frames: Iterable[Frame],
     inference: Inference,
@@ -197,8 +156,8 @@ def two_passes(
     """
     last_needed = np.searchsorted(time_s, time_s + regions.reach_s, side="right") - 1
     waiting: collections.deque[Frame] = collections.deque()
-    early: collections.deque[tuple[int, Result]] = collections.deque()
-    late: collections.deque[tuple[int, Result]] = collections.deque()
+    early: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
+    late: collections.deque[tuple[int, Future[PersonKeypoints]]] = collections.deque()
 
     def second(frame: Frame) -> None:
         while early and early[0][0] <= last_needed[frame.index]:

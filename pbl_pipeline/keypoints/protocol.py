@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -113,17 +112,4 @@ class MirrorDetector(CropDetector, Protocol):
         self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool = False
     ) -> PersonKeypoints:
         """Detect in one of the two, in coordinates of the picture."""
-        ...
-
-
-@runtime_checkable
-class SharedDetector(CropDetector, Protocol):
-    """A `CropDetector` of which several inferences may be under way: `side_by_side` use the device fully."""
-
-    side_by_side: int
-
-    def begin(
-        self, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, inspection: Inspection
-    ) -> Callable[[], PersonKeypoints]:
-        """Begin an inference of a region; the returned function, to be called once, waits for the result."""
         ...

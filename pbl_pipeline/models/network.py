@@ -9,7 +9,6 @@ visible, LiteRT computes also with "cuda", which may be meant for an ONNX model.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import mmap
 import os
@@ -17,7 +16,7 @@ import queue
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -35,8 +34,6 @@ DECODING = {"decoding": True}
 AT_ONCE = 16
 #: Time to wait for an answer of the process that owns the GPU (s), which may compile; then the CPU computes.
 PATIENCE_S = 120.0
-#: A function that waits for a network's outputs, keyed by their number of elements.
-Outputs = Callable[[], dict[int, np.ndarray]]
 #: Bytes of a line; that with the stamps of an hour has 2 MB.
 _LONGEST_LINE = 1 << 24
 
@@ -116,34 +113,17 @@ class Network:
         return AT_ONCE if self.on_gpu else 1
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
-        return self.begin(image)()
-
-    def begin(self, image: np.ndarray) -> Outputs:
-        """Begin the inference of a picture; the returned function, which must be called once, waits for the outputs, or
-        computes them by LiteRT. A thread may begin `side_by_side` before it waits for the first."""
-        remote, asked = self._remote, None
+        remote = self._remote
         if remote is not None:
             try:
-                asked = remote.begin(image)
+                return remote(image)
             except (OSError, EOFError, RuntimeError) as error:
-                self._lost(remote, error)
-
-        def outputs() -> dict[int, np.ndarray]:
-            if asked is not None:
-                try:
-                    return asked()
-                except (OSError, EOFError, RuntimeError) as error:
-                    self._lost(remote, error)
-            with self._lock:
-                assert self._lite is not None
-                return self._spec.decoded(self._lite(self._spec.entered(image)))
-
-        return outputs
-
-    def _lost(self, remote: _Remote | None, error: BaseException) -> None:
+                with self._lock:
+                    if self._remote is remote:
+                        self._fall_back(error)
         with self._lock:
-            if self._remote is remote:
-                self._fall_back(error)
+            assert self._lite is not None
+            return self._spec.decoded(self._lite(self._spec.entered(image)))
 
     def _load(self) -> LiteModel:
         return LiteModel(self._spec.path, self.sha256, self._spec.outputs, self._threads)
@@ -175,36 +155,42 @@ class _Remote:
         self._free = queue.SimpleQueue[int]()
         for place in range(AT_ONCE):
             self._free.put(place)
-        self._sending, self._receiving = threading.Lock(), threading.Lock()
+        self._sending = threading.Lock()
         self._waiting: deque[Future[np.ndarray]] = deque()
+        self._broken: BaseException | None = None
+        self._connection.settimeout(None)  # answers are waited for in `__call__`
+        threading.Thread(target=self._listen, name="gpu-network", daemon=True).start()
 
-    def begin(self, image: np.ndarray) -> Outputs:
-        place, future = self._free.get(), Future[np.ndarray]()
+    def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
+        future: Future[np.ndarray] = Future()
+        place = self._free.get()
         try:
             self._pictures[place] = image
             with self._sending:
+                if self._broken is not None:
+                    raise self._broken
                 self._waiting.append(future)
                 self._connection.sendall(bytes([place]))
-        except BaseException:
-            self._free.put(place)
-            raise
-        return functools.partial(self._answer, future, place)
-
-    def _answer(self, future: Future[np.ndarray], place: int) -> dict[int, np.ndarray]:
-        """Wait for the outputs. Answers come in the order of the pictures; one of the waiting threads receives them."""
-        try:
-            with self._receiving:
-                while not future.done():
-                    reply = np.empty(sum(self._sizes), np.float32)
-                    receive(self._connection, reply)
-                    self._waiting.popleft().set_result(reply)
-        except TimeoutError as error:
-            self._connection.shutdown(socket.SHUT_RDWR)  # the other calls need not wait as long
-            raise RuntimeError(f"the process that owns the GPU did not answer within {PATIENCE_S:g} s") from error
+            try:
+                reply = future.result(PATIENCE_S)
+            except TimeoutError as error:
+                self._connection.shutdown(socket.SHUT_RDWR)  # the other calls need not wait as long
+                raise RuntimeError(f"the process that owns the GPU did not answer within {PATIENCE_S:g} s") from error
+            parts = np.split(reply, np.cumsum(self._sizes)[:-1])
         finally:
             self._free.put(place)
-        parts = np.split(future.result(), np.cumsum(self._sizes)[:-1])
         return dict(zip(self._sizes, parts, strict=True))
+
+    def _listen(self) -> None:
+        try:
+            while receive(self._connection, reply := np.empty(sum(self._sizes), np.float32)):
+                self._waiting.popleft().set_result(reply)
+        except IndexError:  # an answer without a request
+            pass
+        with self._sending:
+            self._broken = EOFError("the process that owns the GPU ended")
+            while self._waiting:
+                self._waiting.popleft().set_exception(self._broken)
 
 
 def share_memory(connection: socket.socket, size: int) -> mmap.mmap:
@@ -260,11 +246,9 @@ def receive_line(connection: socket.socket) -> bytes:
     return line
 
 
-def receive(connection: socket.socket, into: np.ndarray) -> None:
-    """Fill an array with received bytes. Raises EOFError if the other side ended before."""
-    rest = into.data.cast("B")
-    while rest:
-        n = connection.recv_into(rest)
-        if not n:
-            raise EOFError("the process that owns the GPU ended")
-        rest = rest[n:]
+def receive(connection: socket.socket, into: np.ndarray) -> bool:
+    """Fill an array with received bytes; False if the other side ended before."""
+    try:
+        return connection.recv_into(into.data, into.nbytes, socket.MSG_WAITALL) == into.nbytes
+    except OSError:
+        return False

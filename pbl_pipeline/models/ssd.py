@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -66,27 +65,17 @@ class SsdLayout:
 
 
 class SsdModel:
-    """A loaded detector of a layout. Not to be shared by threads. Raises the `PblError`s of `Network`."""
+    """A loaded detector of a layout. Raises the `PblError`s of `Network`."""
 
     def __init__(self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float) -> None:
         # The bars of the letterbox are 0, the network's black (-1), not grey.
         self._model = Network(model_path, sha256, scale=2 / 255, offset=-1.0)
-        self.sha256 = self._model.sha256
+        self.sha256, self.side_by_side = self._model.sha256, self._model.side_by_side
         self._layout, self._min_score = layout, min_score
 
     def find(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find boxes: their corners and keypoints (M, 2 + K, 2) in pixels of `image` (H, W, 3) uint8 BGR, possibly
         beyond it, and scores (M,), best first."""
-        return self._begin(image)()
-
-    def find_all(self, images: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """`find` of each picture, as many at once as keep the device busy."""
-        n = self._model.side_by_side
-        for i in range(0, len(images), n):
-            for found in [self._begin(image) for image in images[i : i + n]]:
-                yield found()
-
-    def _begin(self, image: np.ndarray) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
         size = self._layout.input_size
         height, width = image.shape[:2]
         scale = size / max(height, width)
@@ -95,18 +84,14 @@ class SsdModel:
         left, top = (size - w) // 2, (size - h) // 2
         canvas = np.zeros((size, size, 3), np.uint8)
         canvas[top : top + h, left : left + w] = cv2.cvtColor(small, cv2.COLOR_BGR2RGB)
-        begun = self._model.begin(canvas)
-
-        def found() -> tuple[np.ndarray, np.ndarray]:
-            output, n = begun(), len(self._layout.anchor_centres)
-            raw_boxes = output[n * self._layout.n_values].reshape(n, -1)
-            values, scores = self._layout.decode(raw_boxes, output[n].reshape(n), self._min_score)
-            values, scores = suppress(values, scores, _MIN_IOU)
-            points = values.reshape(-1, self._layout.n_values // 2, 2) * size
-            # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
-            return (points - [left, top]) * [width / w, height / h] - 0.5, scores
-
-        return found
+        output = self._model(canvas)
+        n = len(self._layout.anchor_centres)
+        raw_boxes = output[n * self._layout.n_values].reshape(n, -1)
+        values, scores = self._layout.decode(raw_boxes, output[n].reshape(n), self._min_score)
+        values, scores = suppress(values, scores, _MIN_IOU)
+        points = values.reshape(-1, self._layout.n_values // 2, 2) * size
+        # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
+        return (points - [left, top]) * [width / w, height / h] - 0.5, scores
 
 
 def suppress(values: np.ndarray, scores: np.ndarray, min_iou: float) -> tuple[np.ndarray, np.ndarray]:

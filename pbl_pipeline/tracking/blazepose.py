@@ -9,6 +9,7 @@ above the hips along the body's axis.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -58,17 +59,17 @@ class BlazePoseDetector:
     def __init__(self, model_path: str | Path, min_score: float = 0.5) -> None:
         self._model = SsdModel(model_path, MODEL_SHA256, LAYOUT, min_score)
         self.model_sha256 = self._model.sha256
+        self._threads = ThreadPoolExecutor(self._model.side_by_side, "people")
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         """Find people in `image` (H, W, 3) uint8 BGR, best first. Boxes may reach beyond the picture."""
-        return next(self.detect_all([image]))
+        # After the corners of the box: the middle of the hips and the point on the circle.
+        found = [(circle_roi(p[2], p[3]), score) for p, score in zip(*self._model.find(image), strict=True)]
+        return [Detection(body_box(roi), float(score), roi) for roi, score in found]
 
     def detect_all(self, images: Sequence[np.ndarray]) -> Iterator[list[Detection]]:
-        """`detect` of each picture, side by side on a GPU."""
-        for points, scores in self._model.find_all(images):
-            # After the corners of the box: the middle of the hips and the point on the circle.
-            rois = [circle_roi(*p[2:4]) for p in points]
-            yield [Detection(body_box(roi), float(score), roi) for roi, score in zip(rois, scores, strict=True)]
+        """`detect` of each picture, on a GPU side by side: alone each would wait for its answer."""
+        return (map if len(images) == 1 else self._threads.map)(self.detect, images)
 
 
 class BlazePoseWindows(BlazePoseDetector):

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
@@ -74,9 +74,9 @@ class Counted(BlazePoseWindows):
         super().__init__(assets.fetch("blazepose_detector"), USUAL.min_score)
         self.calls = 0
 
-    def detect_all(self, images: Sequence[np.ndarray]) -> Iterator[list[Detection]]:
-        self.calls += len(images)
-        return super().detect_all(images)
+    def detect(self, image: np.ndarray) -> list[Detection]:
+        self.calls += 1
+        return super().detect(image)
 
 
 def clips(frames: int) -> Iterator[tuple[str, Path, int]]:

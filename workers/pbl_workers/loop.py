@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from pbl_pipeline.video import release_frames
@@ -33,8 +33,6 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
     Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the
     next batch waiting. A job that the batch could not compute is computed alone.
     """
-    if worker.warm_up is not None:
-        wait([worker.warm_up])  # if it failed, so does the first fit, and says why
     table, n, threads = first[0].table, _at_once(worker), 1 if worker.shares_gpu else None
     with ThreadPoolExecutor(max_workers=n, thread_name_prefix="fits") as device:
         waiting = deque([(first, _start(device, first, threads))])
@@ -111,8 +109,7 @@ class Worker:
     job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
     phone: looks often, and for nothing but jobs that are queued. long_waits: called where no job is more urgent than
     that of a long recording, which another process takes. siblings: other processes of this machine also work;
-    shares_gpu: and fit on the same GPU. warm_up: loads the programs of fits, which wait for it; the process then leaves
-    what follows fits to its siblings where it can.
+    shares_gpu: and fit on the same GPU.
     """
 
     tables: Sequence[Any]
@@ -127,7 +124,6 @@ class Worker:
     long_waits: Callable[[], None] | None = None
     siblings: bool = False
     shares_gpu: bool = False
-    warm_up: Future[None] | None = None
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -179,8 +175,6 @@ class Worker:
     def step(self) -> int:
         """Take jobs of the table that is most urgent, and do them; returns how many."""
         conditions, position = self._conditions(), {table: i for i, table in enumerate(self.tables)}
-        if self.warm_up is not None and self.siblings:
-            position |= {t: len(position) for t in self.tables if registry.stage_of(t).resource == registry.FIT}
         ranked = [(urgent, -position[table], table) for table, urgent in queue.most_urgent(conditions).items()]
         if self.long_waits is not None and time.monotonic() - self._looked_for_long > LONG_EVERY_S:
             self._looked_for_long = time.monotonic()

@@ -10,7 +10,6 @@ import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -115,7 +114,6 @@ def work(options: Options, pipe: Connection) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
     import pbl_schemas
-    from pbl_pipeline.jax_setup import use_cpu
 
     from . import heartbeat, loop, selftest
 
@@ -132,9 +130,6 @@ def work(options: Options, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, end)  # a terminal sends it to all; the supervisor decides
     signal.signal(signal.SIGUSR1, end_now)
     to_stderr()
-    if options.gpus and registry.FIT not in registry.GROUPS[options.resource]:
-        # Its small programs take less time on a core than a GPU takes to begin; other processes have the networks.
-        use_cpu()
     try:
         if not _connected(pbl_schemas, stop):
             return
@@ -167,9 +162,6 @@ def work(options: Options, pipe: Connection) -> None:
         )
         worker.siblings = options.processes > 1 and not options.long
         worker.shares_gpu = options.shares_gpu
-        if options.gpus and options.resource == "all" and not (options.short or options.long):
-            # It alone fits, and the others have nothing to be fitted yet.
-            worker.warm_up = ThreadPoolExecutor(1, "warm-up").submit(selftest.warm_up)
         if options.short:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)

@@ -43,7 +43,7 @@ STAGES: dict[str, Stage] = {
     "Keypoints": Stage(DETECTOR, 4 * 3600.0, 1),
     "TrialInput": Stage(LIGHT, 300.0, 16),
     "SessionFit": Stage(FIT, 4 * 3600.0, 1),
-    "GaitEvents": Stage(LIGHT, 600.0, 4),
+    "GaitEvents": Stage(LIGHT, 600.0, 16),
     "GaitCycle": Stage(LIGHT, 600.0, 16),
     "Spatiotemporal": Stage(LIGHT, 300.0, 16),
     "GDI": Stage(LIGHT, 300.0, 16),

@@ -34,19 +34,6 @@ def check(tables: Sequence[Any]) -> None:
         _cadence()
 
 
-def warm_up() -> None:
-    """Fit walks of the usual kind side by side on a GPU, so that the programs for few and for many are loaded."""
-    import jax
-
-    from pbl_pipeline.fit import SessionInput, fit_sessions
-    from pbl_pipeline.fit.lanes import FEW
-    from pbl_pipeline.synthetic import SynthSpec, synthesise
-
-    if jax.default_backend() != "cpu":
-        walk = synthesise(SynthSpec(seed=1, seconds=7.0, marker_set="blazepose_33")).keypoints
-        fit_sessions([SessionInput([walk], ["warm-up"])] * (FEW + 1))
-
-
 def _store() -> None:
     try:
         check_store(store_backend())
