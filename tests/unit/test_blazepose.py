@@ -128,7 +128,9 @@ def test_on_a_gpu_the_windows_of_a_picture_are_asked_for_together(detector, fram
     together = threading.Barrier(3, timeout=5)
 
     class Shared(Network):
-        side_by_side = 3
+        @property
+        def side_by_side(self) -> int:
+            return 3
 
         def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
             together.wait()
