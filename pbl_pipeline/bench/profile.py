@@ -35,8 +35,8 @@ KINDS = (
 
 def kind_of(frame: FrameType | None) -> str:
     """Return what a thread with this innermost frame does; "other" where nothing matches."""
-    while frame is not None:
-        code = frame.f_code
+    # Of a thread that goes on meanwhile, Python 3.11 at times returns another object than the frame before.
+    while (code := getattr(frame, "f_code", None)) is not None and frame is not None:
         for kind, path, name in KINDS:
             if path in code.co_filename and code.co_name.startswith(name):
                 return kind

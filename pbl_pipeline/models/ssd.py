@@ -65,12 +65,12 @@ class SsdLayout:
 
 
 class SsdModel:
-    """A loaded detector of a layout. Not to be shared by threads. Raises the `PblError`s of `Network`."""
+    """A loaded detector of a layout. Raises the `PblError`s of `Network`."""
 
     def __init__(self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float) -> None:
         # The bars of the letterbox are 0, the network's black (-1), not grey.
         self._model = Network(model_path, sha256, scale=2 / 255, offset=-1.0)
-        self.sha256 = self._model.sha256
+        self.sha256, self.side_by_side = self._model.sha256, self._model.side_by_side
         self._layout, self._min_score = layout, min_score
 
     def find(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

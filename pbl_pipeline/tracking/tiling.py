@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -51,13 +50,17 @@ def detect_in(
     much, and so only confirm detections in another window.
     """
     width, height = size_of(scene)
-    found: list[tuple[float, Detection]] = []
+    found, parts = list[tuple[float, Detection]](), []
     for window, weight in [*((w, 1.0) for w in windows), *((w, 0.5 if windows else 1.0) for w in passing)]:
         x0, y0, x1, y1 = max(window[0], 0), max(window[1], 0), min(window[2], width), min(window[3], height)
-        if x1 - x0 < 16 or y1 - y0 < 16:
-            continue
-        for d in _seen(detector, scene, window, (x0, y0, x1, y1)):
-            box, roi = d.box_px, d.roi_px
+        if x1 - x0 >= 16 and y1 - y0 >= 16:
+            parts.append(((x0, y0, x1, y1), weight, *_shown(detector, scene, window, (x0, y0, x1, y1))))
+    shown, together = [image for _, _, image, *_ in parts], getattr(detector, "detect_all", None)
+    seen = together(shown) if together is not None else map(detector.detect, shown)
+    for ((x0, y0, x1, y1), weight, _, scale, x, y), people in zip(parts, seen, strict=True):
+        for d in people:
+            box = d.box_px * scale + np.array([x, y, x, y])
+            roi = d.roi_px * np.array([scale, scale, scale, 1.0]) + np.array([x, y, 0, 0])
             if not np.isfinite(roi).all() and _cut(box, (x0, y0, x1, y1), (width, height)):
                 continue
             whole = _area(np.clip(box, 0, [width, height, width, height]))
@@ -73,26 +76,18 @@ def size_of(scene: Scene) -> tuple[int, int]:
     return scene.size_px if isinstance(scene, Frame) else (scene.shape[1], scene.shape[0])
 
 
-def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window) -> list[Detection]:
-    """Return the detections in a window, of which `inside` lies in the picture, in pixels of the picture."""
+def _shown(
+    detector: PersonDetector, scene: Scene, window: Window, inside: Window
+) -> tuple[np.ndarray, float, float, float]:
+    """Return what a detector sees of a window, of which `inside` lies in the picture, with its scale and origin."""
     x, y, right, bottom = inside
-    scale = 1.0
     if isinstance(scene, Frame) and isinstance(detector, WindowDetector):
         n, side = detector.window_px, max(window[2] - window[0], window[3] - window[1])
         scale = side / n
         # Position of the first pixel's centre.
-        x, y = ((window[i] + window[i + 2] - side + scale - 1) / 2 for i in (0, 1))
-        shown = scene.cut(np.array([[scale, 0.0, x], [0.0, scale, y]]), (n, n))
-    else:
-        shown = (scene.image if isinstance(scene, Frame) else scene)[y:bottom, x:right]
-    return [
-        dataclasses.replace(
-            d,
-            box_px=d.box_px * scale + np.array([x, y, x, y]),
-            roi_px=d.roi_px * np.array([scale, scale, scale, 1.0]) + np.array([x, y, 0, 0]),
-        )
-        for d in detector.detect(shown)
-    ]
+        left, top = ((window[i] + window[i + 2] - side + scale - 1) / 2 for i in (0, 1))
+        return scene.cut(np.array([[scale, 0.0, left], [0.0, scale, top]]), (n, n)), scale, left, top
+    return (scene.image if isinstance(scene, Frame) else scene)[y:bottom, x:right], 1.0, x, y
 
 
 def merge(found: list[tuple[float, Detection]]) -> list[Detection]:

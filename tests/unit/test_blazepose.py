@@ -5,6 +5,7 @@ The tests with models need the assets and skip where those are absent and cannot
 
 import dataclasses
 import hashlib
+import threading
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from pbl_pipeline.keypoints import METHODS, BlazePoseLandmarks, KeypointParams
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES, blazepose
 from pbl_pipeline.keypoints.passes import ParallelInference
 from pbl_pipeline.keypoints.protocol import Inspection
-from pbl_pipeline.models import LiteModel, suppress
+from pbl_pipeline.models import LiteModel, Network, ssd, suppress
 from pbl_pipeline.models.tflite import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking.blazepose import LAYOUT
@@ -121,6 +122,25 @@ def test_tiles_find_both_people_and_the_whole_frame_does_not(detector, frames):
     assert np.hypot(*(woman[:2] - [1005, 715])) < 40
     assert abs(woman[3]) < 0.3
     assert not [d for d in detector.detect(image) if d.score > 0.9]
+
+
+def test_on_a_gpu_the_windows_of_a_picture_are_asked_for_together(detector, frames, monkeypatch):
+    together = threading.Barrier(3, timeout=5)
+
+    class Shared(Network):
+        @property
+        def side_by_side(self) -> int:
+            return 3
+
+        def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
+            together.wait()
+            return super().__call__(image)
+
+    monkeypatch.setattr(ssd, "Network", Shared)
+    windows = tiles(1768, 994, 0.7, 0.3)[:3]
+    shared = detect_in(BlazePoseDetector(assets.fetch("blazepose_detector")), frames[100], windows)
+    alone = detect_in(detector, frames[100], windows)
+    assert [d.roi_px.tolist() for d in shared] == [d.roi_px.tolist() for d in alone] != []
 
 
 def test_no_person_in_noise_or_flat_pictures(detector):
