@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -245,6 +246,24 @@ BROKEN = {
     "says nothing": lambda at: [opened(at) for _ in range(20)],
     "half a line": lambda at: [opened(at, b"{") for _ in range(20)],
 }
+
+
+def test_a_gpu_that_is_too_small_computes_fewer_pictures_at_a_time() -> None:
+    program: Any = object.__new__(gpu_server.Program)
+    room = 4
+
+    def run(_: object, images: np.ndarray) -> np.ndarray:
+        if len(images) > room:
+            raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
+        return images[:, 0, 0, :1].astype(np.float32)
+
+    program.batch, program._weights, program._run = 16, None, run
+    pictures = np.arange(16, dtype=np.uint8)[:, None, None, None]
+    assert program(pictures).ravel().tolist() == [*range(16)]
+    assert program.batch == room
+    room = 1
+    with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED"):  # then the CPU computes
+        program(pictures)
 
 
 @pytest.mark.parametrize("kind", BROKEN)
