@@ -1,6 +1,6 @@
 """Errors a person can act on: a code, what was expected and found, and the next step.
 
-`CODES` are the library's; packages above it and laboratories `register` theirs. `docs/errors.md` explains each of ours,
+`CODES` are the library's; packages above it and laboratories `register` theirs. `docs/errors.md` lists each of ours,
 and a test fails when the two differ.
 """
 
