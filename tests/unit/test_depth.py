@@ -345,7 +345,7 @@ def test_depths_of_other_trials_are_refused():
         ({}, "", PASS),
         ({"distance": 2.0}, "depth_distance_ratio", FAIL),
         ({"used": 0.05}, "depth_share_used", WARN),
-        ({"fits": 0.6}, "depth_share_on_person", WARN),
+        ({"fits": 0.88}, "depth_share_on_person", WARN),
         ({"z": 3.0}, "depth_misfit_sd", WARN),
     ],
 )
