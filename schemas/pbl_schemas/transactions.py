@@ -117,9 +117,9 @@ def keep_files(work: Callable[[], T], until: Callable[[], bool] = lambda: False)
     except Exception as error:
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in CLIENTS:
             raise
-        file = Path(getattr(error, "filename", None) or settings.store_dir())
-        in_store = not file.is_absolute() or file.is_relative_to(settings.store_dir())
-        raise store_error(error) if in_store or not isinstance(error, OSError) else unkept(error) from error
+        name = getattr(error, "filename", None)  # an object store's client has others, or a number
+        of_file = isinstance(name, (str, Path)) and not Path(name).absolute().is_relative_to(settings.store_dir())
+        raise unkept(error) if of_file and isinstance(error, OSError) else store_error(error) from error
 
 
 def next_id(table: Any, attribute: str, n: int = 1) -> int:
