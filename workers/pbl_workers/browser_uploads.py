@@ -156,7 +156,7 @@ def register(
             if not one.is_log:
                 its_log = logs.pop(PurePosixPath(one.name).stem, None)
                 out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], by))
-        out += [_attach(to, worn, by)] if worn else []
+    out += [_attach(to, worn, by)] if worn else []
     alone = functools.partial(
         _refused,
         found="a sensor log alone",

@@ -24,7 +24,7 @@ from .records import usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.depth import DepthFile
-    from pbl_pipeline.sensors import Given, SensorLog
+    from pbl_pipeline.sensors import Given
     from pbl_pipeline.video import PhoneLog
 
 #: As a path of `--attitude`, `--depth` or `--imu`: none for this video or at its visit, or no longer.
@@ -60,16 +60,13 @@ class Sensors:
         """True if a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
-    def read(
-        self, read_sensors: Callable[[Sequence[Given]], Sequence[SensorLog]] | None = None
-    ) -> tuple[Sensors, PhoneLog | None]:
+    def read(self, read_sensors: Callable[..., Any] | None = None) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
         FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
         USAGE as `read_given` (or `read_sensors`, in its place); USAGE for a name that cannot be kept; STORE_FULL: no
         room for the zip of a folder.
         """
-        from pbl_pipeline.depth import check_recording
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
@@ -80,11 +77,6 @@ class Sensors:
         logs = iter((read_sensors or read_given)([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        if self.depth is not None and str(self.depth.file) != NONE:
-            try:
-                check_recording(self.depth)
-            except OSError as error:
-                raise unkept(error) from error
         return dataclasses.replace(self, imu=imu, kept={}).packed(), log
 
     def _there(self) -> list[tuple[str, Path]]:
@@ -95,7 +87,7 @@ class Sensors:
     def packed(self) -> Sensors:
         """These files, which were read, with what is kept of them; themselves while their copies are there. Raises
         `PblError` as `read`."""
-        from pbl_pipeline.depth import pack
+        from pbl_pipeline.depth import check_recording, pack
 
         kept: dict[tuple[str, Path], Kept] = {}
         there, room = self._there(), None
@@ -103,6 +95,8 @@ class Sensors:
             return self
         try:
             room = new_folder() if any(path.is_dir() for _, path in there) else None
+            if self.depth is not None and ("depth", self.depth.file) in there:
+                check_recording(self.depth)
             for prefix, path in there:
                 zip_of = pack if prefix == "depth" else _zipped
                 copy = zip_of(path, room.path / f"{prefix}{len(kept)}.zip") if room and path.is_dir() else path
@@ -242,11 +236,11 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
         about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
         _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
-        where = said("sensors on {segments}", segments=joined(sorted(own)))
-        where = where if own else "kept and not read: no segment of the body is known"
-        instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else said("")
-        text = "wearable IMU file {name} was attached{instead}, {where}"
-        done.append(said(text, name=file.name, instead=instead, where=where))
+        where = "kept and not read: no segment of the body is known"
+        where = said("sensors on {segments}", segments=joined(sorted(own))) if own else where
+        instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else ""
+        told = {"name": file.name, "instead": instead, "where": where}
+        done.append(said("wearable IMU file {name} was attached{instead}, {where}", **told))
         worn |= bool(own)
     if worn:
         done += fit.check_sensors(visit)
