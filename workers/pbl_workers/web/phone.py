@@ -25,7 +25,7 @@ from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Re
 
 from pbl_pipeline import texts
 from pbl_pipeline.bounded import parse_json
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, joined
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
 from pbl_pipeline.temporary import new_folder
@@ -204,11 +204,12 @@ async def worn(request: Request) -> Response:
         raise Refused("form")
     with new_folder() as folder:
         given = await _on_disk(phone_uploads.read_log, folder, name, segment, body)
-        await site.ask(request, attach_worn, phone.session_id, given)
+        done = await site.ask(request, attach_worn, phone.session_id, given)
     with contextlib.suppress(PblError):  # others wait
         compute(request, phone.session_id, False)
     language = reader_language(request)
-    return JSONResponse({"segments": ", ".join(texts.library_words(language, one.segment or "") for one in given.imu)})
+    said = texts.library_words(language, joined(done, "; ")) if done else texts.text(language, "upload.known")
+    return JSONResponse({"said": said})
 
 
 class Phones:
