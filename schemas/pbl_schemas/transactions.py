@@ -110,8 +110,8 @@ def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: Fa
 
 
 def keep_files(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
-    """Run `work`, which puts files into the store, as `in_transaction` that is `fresh`. Raises `PblError` FILE_MISSING
-    for one of these files, else STORE_FULL, STORE_UNAVAILABLE; errors of the database as they are."""
+    """Run `work`, which puts files into the store, as `in_transaction` that is `fresh`. Raises `PblError` FILE_MISSING,
+    MACHINE_SHORT for one of these files, else STORE_FULL, STORE_UNAVAILABLE; errors of the database as they are."""
     try:
         return in_transaction(work, until, fresh=True)
     except Exception as error:
