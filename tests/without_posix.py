@@ -91,7 +91,9 @@ def each(*calls: Iterable[object], packages: Path = ROOT, variables: Mapping[str
     env = {**os.environ, "PYTHONPATH": str(packages), **(variables or {})}
     done = subprocess.run(words, capture_output=True, env=env, timeout=300, check=False)
     assert done.returncode == 0, done.stderr.decode()
-    return [Done(*end) for end in json.loads(done.stdout)]
+    ends = json.loads(done.stdout)
+    assert len(ends) == len(calls), done.stderr.decode()
+    return [Done(*end) for end in ends]
 
 
 def pbl(*arguments: object, **options: Any) -> Done:

@@ -130,8 +130,9 @@ def mounting_of(mount: str) -> np.ndarray:
     """The rotation (quaternion, scalar first) from a sensor's axes to its segment's, by the directions of two of them:
     `x up, z back`. Raises `PblError` USAGE."""
     text = mount.lower()
-    found = dict(re.findall(r"\b([xyz])\s+([a-z]+)", text))
-    if re.sub(r"\b[xyz]\s+[a-z]+|[\s,;]", "", text) or len(found) != 2 or not set(found.values()) <= set(_DIRECTIONS):
+    found = dict(pairs := re.findall(r"\b([xyz])\s+([a-z]+)", text))
+    rest = re.sub(r"\b[xyz]\s+[a-z]+|[\s,;]", "", text)
+    if rest or not len(pairs) == len(found) == 2 or not set(found.values()) <= set(_DIRECTIONS):
         found = {}
     axes = np.zeros((3, 3))
     for axis, word in found.items():

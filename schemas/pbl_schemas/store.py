@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import importlib.util
 import json
@@ -185,9 +186,10 @@ def store_errors() -> Iterator[None]:
 
 def unkept(error: OSError) -> PblError:
     """Return the coded error for a file that could not be read to be kept, or of which no copy could be written."""
-    next_step = "check the path, and that you may read the file"
-    missing = PblError("FILE_MISSING", error.strerror or str(error), "files to keep", next_step, error.filename)
-    return store_full(error) or missing
+    next_step = "check the path, and that you may read the file; else try again"
+    of_path = error.errno in (errno.ENOENT, errno.EACCES, errno.ENOTDIR, errno.EISDIR)
+    code, found = "FILE_MISSING" if of_path else "MACHINE_SHORT", error.strerror or str(error)
+    return store_full(error) or PblError(code, found, "files to keep", next_step, error.filename)
 
 
 def store_error(error: BaseException) -> PblError:

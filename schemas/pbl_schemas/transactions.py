@@ -110,16 +110,16 @@ def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: Fa
 
 
 def keep_files(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
-    """Run `work`, which puts files into the store, as `in_transaction` that is `fresh`. Raises `PblError` FILE_MISSING
-    for one of these files, else STORE_FULL, STORE_UNAVAILABLE; errors of the database as they are."""
+    """Run `work`, which puts files into the store, as `in_transaction` that is `fresh`. Raises `PblError` FILE_MISSING,
+    MACHINE_SHORT for one of these files, else STORE_FULL, STORE_UNAVAILABLE; errors of the database as they are."""
     try:
         return in_transaction(work, until, fresh=True)
     except Exception as error:
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in CLIENTS:
             raise
-        file = Path(getattr(error, "filename", None) or settings.store_dir())
-        in_store = not file.is_absolute() or file.is_relative_to(settings.store_dir())
-        raise store_error(error) if in_store or not isinstance(error, OSError) else unkept(error) from error
+        name = getattr(error, "filename", None)  # an object store's client has others, or a number
+        of_file = isinstance(name, (str, Path)) and not Path(name).absolute().is_relative_to(settings.store_dir())
+        raise unkept(error) if of_file and isinstance(error, OSError) else store_error(error) from error
 
 
 def next_id(table: Any, attribute: str, n: int = 1) -> int:

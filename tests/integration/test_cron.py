@@ -8,6 +8,7 @@ import time
 from pathlib import Path, PurePosixPath
 
 import pytest
+from datajoint.storage import StorageBackend
 
 import pbl_schemas
 from pbl_pipeline.errors import PblError
@@ -146,6 +147,19 @@ def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path,
     assert files(drop) == ["P001/1/walk.csv", "P001/1/walk.mp4"]
     assert [p.name for p in archive.rglob("*") if p.is_file()] == ["seen.json"]
     assert look(drop, archive).registered == ["P001/1/walk.mp4"]
+
+
+def test_a_full_store_ends_the_run_and_every_upload_stays(drop: Path, archive: Path, faults: Faults):
+    for subject in ("P001", "P002"):
+        upload(drop, f"{subject}/1/walk.mp4", subject)
+        (drop / f"{subject}/1/walk.csv").write_text(LOG)
+    look(drop, archive)
+    there = files(drop)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with faults(StorageBackend, "put_buffer", full) as calls, pytest.raises(PblError) as error:
+        look(drop, archive)
+    assert (error.value.code, len(calls), files(drop)) == ("STORE_FULL", 1, there)
+    assert sorted(look(drop, archive).registered) == ["P001/1/walk.mp4", "P002/1/walk.mp4"]
 
 
 def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, archive: Path):

@@ -10,6 +10,7 @@ import av
 import pymysql
 import pytest
 
+from pbl_pipeline import depth
 from pbl_schemas import lab, session, video
 from pbl_schemas.intake import videos
 from pbl_schemas.intake.recording_sheet import COLUMNS, ingest_sheet
@@ -236,7 +237,7 @@ def test_a_recording_of_another_visit_or_person_is_named_with_the_way_out(tables
         assert "pbl move" in done.err
 
 
-def test_depths_and_sensors_of_a_sheet(tables, recordings):
+def test_depths_and_sensors_of_a_sheet(tables, recordings, monkeypatch: pytest.MonkeyPatch):
     """Paths are relative to the sheet; a visit's sensors may stand in each of its rows; nothing is left over."""
     chain.depth_pictures(recordings / "depth")
     several = {"Right Ankle": Swing(), "Right Thigh": Swing(phase=1)}
@@ -260,6 +261,22 @@ def test_depths_and_sensors_of_a_sheet(tables, recordings):
     rows = ["one.mp4,P001,1,,shank_r=apdm.csv", "two.mp4,P001,1,,thigh_r=apdm.csv"]
     told = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="two.csv"))
     assert (told.error_code, "imu shank_r=apdm.csv and thigh_r=apdm.csv" in told.err) == ("SHEET_CONFLICT", True)
+    # Copies of depths lie there one at a time; "none" is an empty cell, and paths are compared as what they lead to.
+    chain.depth_pictures(recordings / "depth2")
+    copies, pack = Path(tempfile.gettempdir()), depth.pack
+    at_once: list[int] = []
+
+    def counted(folder: Path, copy: Path) -> Path:
+        pack(folder, copy)
+        at_once.append(len(list(copies.glob(f"pbl-tmp-{os.getpid()}-*/*.zip"))))
+        return copy
+
+    monkeypatch.setattr(depth, "pack", counted)
+    rows = ['one.mp4,P001,1,"0,001=depth",worn.csv', "two.mp4,P001,1,0.001=depth2,./worn.csv"]
+    rows.append("three.mp4,P001,1,none,none")
+    told = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="paths.csv"), "--dry-run")
+    assert told.code == 0, told.err
+    assert at_once == [1, 1]
     rows = ['one.mp4,P001,1,"0,001=depth",worn.csv', "two.mp4,P001,1,none,worn.csv", "three.mp4,P002,1,,none"]
     path = sheet(recordings, *rows, header=header, name="beside.csv")
     for more, found in (("--dry-run",), 0), ((), 1):
@@ -271,4 +288,7 @@ def test_depths_and_sensors_of_a_sheet(tables, recordings):
     assert (row["video_id"], row["depth_name"], row["depth_scale"]) == (1, "depth", 0.001)
     row = video.WearableImu.fetch1()
     assert (row["video_id"], row["imu_segments"]) == (1, {"shank_r": "Right Ankle", "thigh_r": "Right Thigh"})
+    assert set(at_once) == {1}
+    again = pbl("ingest", "--sheet", path, "--dry-run").out
+    assert again.count("left as it is, without the sensor files of this row") == 2
     assert not list(Path(tempfile.gettempdir()).glob(f"pbl-tmp-{os.getpid()}-*/*.zip"))

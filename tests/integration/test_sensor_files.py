@@ -263,6 +263,7 @@ def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_i
 
 def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
     path = chain.small_video(tmp_path, "a")
+    both = {"shank_r": "Right Ankle", "thigh_r": "Right Thigh"}
     swings = {name: Swing(phase=i) for i, name in enumerate(("Right Ankle", "Right Thigh", "Lumbar"))}
     several = worn_sensor.apdm(swings, tmp_path / "apdm.csv")
     (tmp_path / "list.csv").write_text("segment,file,rate_hz\npelvis,apdm.csv,128\n")
@@ -272,6 +273,19 @@ def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
     (row,) = video.WearableImu.to_dicts()
     assert row["imu_segments"] == {"shank_r": "Right Ankle", "thigh_r": "Right Thigh", "pelvis": "Lumbar"}
     assert row["imu_rate"] == 128
+    # A mount goes with its segment to another file; the same sensor again changes nothing.
+    (tmp_path / "mounts.toml").write_text(
+        "".join(f"{s}={{file='apdm.csv', sensor='{n}', rate_hz=128, mount='x up, z back'}}\n" for s, n in both.items())
+    )
+    other = worn_sensor.apdm({"Right Thigh": Swing(phase=5)}, tmp_path / "other.csv")
+    for how in (tmp_path / "mounts.toml", f"thigh_r={other}"):
+        assert pbl("ingest", path, "--subject", "P001", "--imu", how).code == 0
+    row = video.WearableImu.to_dicts()[0]
+    assert list(row["imu_mounts"]) == ["shank_r"]
+    text = (tmp_path / "mounts.toml").read_text()
+    (tmp_path / "mounts.toml").write_text(text.split("\n")[0])
+    assert "nothing was inserted" in pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "mounts.toml").out
+    assert pbl("ingest", path, "--subject", "P001", "--imu", f"thigh_r={several}").code == 0
     # A sensor with another clock is refused here, not by the fit.
     foot = worn_sensor.xsens(Swing(phase=4), tmp_path / "MT_1-000_00B42D4B.txt")
     told = pbl("ingest", path, "--subject", "P001", "--imu", f"foot_r={foot}")
@@ -359,6 +373,9 @@ def test_the_uncertainty_of_a_calibration_is_stored(tmp_path: Path):
         (OSError(errno.EIO, "Input/output error"), "STORE_UNAVAILABLE"),
         (PermissionError(errno.EACCES, "Permission denied", "in the store"), "STORE_UNAVAILABLE"),
         (FileNotFoundError(errno.ENOENT, "No such file", "/tmp/shank.csv"), "FILE_MISSING"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "shank.csv"), "FILE_MISSING"),
+        (OSError(errno.EMFILE, "Too many open files", "shank.csv"), "MACHINE_SHORT"),
+        (OSError(errno.EBADF, "Bad file descriptor", 7), "STORE_UNAVAILABLE"),
         (type("EndpointConnectionError", (Exception,), {"__module__": "botocore.exceptions"})(), "STORE_UNAVAILABLE"),
     ],
 )

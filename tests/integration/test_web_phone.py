@@ -837,6 +837,14 @@ def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, killed
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
 
 
+def test_a_reader_is_told_of_missing_logs_without_the_way_to_send_them(visit: int, tmp_path: Path):
+    begin(phone(visit), film(tmp_path), worn="on")
+    for role, links in (("reader", 0), ("reviewer", 2)):
+        page = web.client(role=role).get(f"/visits/{visit}").text
+        assert "none of their logs" in page
+        assert page.count(f"/visits/{visit}/upload") == links
+
+
 def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):
     """Its log beside it could be that of a registered one: the tables know, and no thread of files asks them."""
     target = tmp_path / "archive" / "P001" / "2026-01-10" / "0123-walk.mp4"

@@ -1,6 +1,8 @@
 """Registering in the browser: a visit, its recordings and what is stated of them, from the form to the row."""
 
 import asyncio
+import errno
+import os
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,15 +10,17 @@ from typing import Any
 
 import pymysql
 import pytest
+from datajoint.storage import StorageBackend
 
 from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from pbl_schemas import lab, session, study, video
+from pbl_schemas.operations.archive import remove_unfinished, unfinished
 from pbl_schemas.reading.shown import shown_visit
 from pbl_schemas.reading.visit_list import STATES, Filter, visit_page
 from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
-from pbl_workers import refresh
+from pbl_workers import browser_uploads, refresh
 from pbl_workers.populate import populate
 from pbl_workers.web import multipart
 from tests import Environment, Faults
@@ -528,8 +532,63 @@ def test_logs_of_wearable_sensors_go_with_the_visit(tmp_path: Path, archive: Pat
     assert "no known format" in page
     assert "Choose at least one video" not in page
     assert f"{shank.name}: registered" in page
-    assert send(shank, segment="thigh_l").status_code == 303
+    page = send(shank, segment="thigh_l").text
+    assert "sensors on left thigh" in page
+    assert '<option value="thigh_l" selected>' in page
+    assert '<option value="walking" selected>' in page
+    assert "registered before" in send(shank, segment="thigh_l").text  # and nothing was decided
     (row,) = video.WearableImu.to_dicts()
     assert (row["imu_name"], row["imu_segments"]) == (shank.name, {"thigh_l": "right shank"})
+    sensors = [one for one in Decision().to_dicts() if one["decision_what"] == "sensors"]
+    assert [one["decision_after"] for one in sensors] == [{"sensors": ["shank_r"]}, {"sensors": ["thigh_l"]}]
+    assert re.search(r"sensors added.*?left thigh", browser.get("/visits/1").text, re.DOTALL)
     assert send(shank, segment="knee").status_code == 415
     assert not list(archive.rglob("browser-*"))
+
+
+def test_logs_of_one_form_are_of_one_recording(tmp_path: Path, archive: Path, faults: Faults):
+    """Two on one segment are refused; new ones take the place of the old ones, with which they have no time in common;
+    an error of this machine is not one of the files."""
+    browser = web.client(name="A. First")
+    new(browser)
+    assert upload(browser, small_video(tmp_path, "walk")).status_code == 303
+
+    def send(turn: int, segment: str = "", later_s: float = 0.0):
+        files = []
+        for i, name in enumerate(("right shank", "left thigh")):
+            swing = Swing(phase=i + 2 * turn)
+            table = swing.own()
+            table["time_s"] += later_s
+            files.append(("worn", (f"{name}.{turn}.csv", swing.write(tmp_path / f"{i}.csv", table).read_bytes())))
+        fields = {"token": web.token(browser), "segment": segment}
+        return browser.post("/visits/1/upload", data=fields, files=files, follow_redirects=False)
+
+    assert "one of them twice" in send(0, "shank_r").text
+    assert len(video.WearableImu()) == 0
+    assert "sensors on right shank" in send(0).text
+    with faults(StorageBackend, "put_buffer", OSError(errno.ENOSPC, "No space left on device")):
+        assert send(1, later_s=9000.0).status_code == 507
+    assert "was attached instead of right shank.0.csv" in send(1, later_s=9000.0).text
+    names = {str(name) for name in video.WearableImu().to_arrays("imu_name")}
+    assert names == {"right shank.1.csv", "left thigh.1.csv"}
+    assert not list(archive.rglob("browser-*"))
+
+
+def test_a_log_of_any_ending_is_no_note_of_the_archive(tmp_path: Path, archive: Path):
+    """Not while it arrives, and a note of another place removes nothing."""
+    browser = web.client(name="A. First")
+    new(browser)
+    kept = tmp_path / "kept.txt"
+    kept.write_text("kept")
+    arriving = browser_uploads.Arriving(browser_uploads.place(1), "a.placed", worn=True)
+    arriving.write(os.fsencode(kept))
+    arriving.finish()
+    (begun,) = unfinished(archive)
+    assert (begun.path.suffix, begun.n_bytes) == ("", len(os.fsencode(kept)))
+    for place in (kept, Path("../../kept.txt"), Path("1/../../../kept.txt"), Path("../kept.txt")):
+        note = begun.path.parent / "walk.mp4.placed"
+        note.write_bytes(os.fsencode(place))
+        assert len(remove_unfinished(archive, days=-1.0)) in (1, 2)
+        assert kept.exists()
+        begun.path.parent.mkdir(parents=True, exist_ok=True)
+    arriving.discard()

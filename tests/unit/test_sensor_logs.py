@@ -195,6 +195,7 @@ def test_a_mounting_stated_in_a_list(tmp_path: Path):
     for text in (
         "x up",
         "x up x back",
+        "z up z back x left",
         "x up, y down",
         "x up, z behind",
         "x up, z back please",

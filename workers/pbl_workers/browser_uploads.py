@@ -9,19 +9,19 @@ import hashlib
 import logging
 import os
 import secrets
-import shutil
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
-from pbl_pipeline.errors import CODES, MACHINE, PblError
-from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.errors import CODES, MACHINE, PblError, joined
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import queue_visit, record
-from pbl_schemas.intake import Registered, VisitRecord
+from pbl_schemas.intake import Registered, Sensors, VisitRecord
+from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
+from pbl_schemas.operations.folders import private_folder, remove_empty
 
-from .incoming import VIDEO_ENDINGS, Copy, attach_log, check_log, check_opens, keep_free, register_copies
+from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, read_worn, register_copies, sensors_of
 from .log import event
 
 log = logging.getLogger("pbl.web")
@@ -40,13 +40,15 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Received:
-    """Outcome of a file: its name as it was sent; status as in `Registered`."""
+    """Outcome of a file: its name as it was sent; status as in `Registered`. worn: of wearable sensors, all logs of a
+    form that could be read together; note: what was done with them."""
 
     name: str
     status: str
     video_id: int | None = None
     error: PblError | None = None
-    worn: bool = False  # of a wearable sensor
+    worn: bool = False
+    note: str = ""
 
 
 def place(session_id: int) -> Place:
@@ -58,7 +60,7 @@ def place(session_id: int) -> Place:
 class Arriving:
     """A file that arrives: written under a new name in the person's folder of the archive, and hashed. Raises
     `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes; OSError.
-    worn: the log of a wearable sensor, of any ending."""
+    worn: the log of a wearable sensor, of any ending, in a folder of its own."""
 
     def __init__(self, to: Place, name: str, worn: bool = False) -> None:
         self.name, self.worn = plain_name(PurePosixPath(name.replace("\\", "/")).name), worn
@@ -73,7 +75,8 @@ class Arriving:
             )
         self._most = LARGEST_LOG if worn or ending in LOG_ENDINGS else LARGEST
         folder = folder_of(archive_dir(), PHONE, to.subject)
-        self.path = folder / f"browser-{secrets.token_hex(6)}{ending}"
+        own = f"browser-{secrets.token_hex(6)}"
+        self.path = private_folder(folder / own) / self.name if worn else folder / f"{own}{ending}"
         self._file = open(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")  # noqa: SIM115
         self._sum, self._n = hashlib.sha256(), 0
 
@@ -103,26 +106,44 @@ class Arriving:
         """Remove the file; one that was registered has another name and stays."""
         self._file.close()
         self.path.unlink(missing_ok=True)
+        remove_empty(self.path.parent, int(self.worn))
 
 
-def check(arrived: Arriving) -> PblError | None:
-    """Return what is wrong with a file that arrived, or could not be checked (`check_opens`, `check_log`); or None."""
+def check(
+    whole: Sequence[tuple[Arriving, Copy]], segment: str
+) -> tuple[list[tuple[Arriving, Copy]], Sensors, list[Received]]:
+    """Return the files of a form that may be registered, its logs of wearable sensors, and what is refused of them, or
+    could not be checked (`check_opens`, `check_log`, `sensors_of`, `read_worn`)."""
+    good, given, refused = [], [], []
+    videos = {PurePosixPath(one.name).stem for one, _ in whole if not (one.is_log or one.worn)}
+    for one, copy in whole:
+        try:
+            if one.worn:
+                given += sensors_of(one.path, segment)
+                continue
+            if not one.is_log or PurePosixPath(one.name).stem in videos:  # a log alone is refused as such
+                (check_log if one.is_log else check_opens)(one.path)
+            good.append((one, copy))
+        except PblError as error:
+            refused.append(Received(one.name, "refused", error=error.with_key(one.name), worn=one.worn))
     try:
-        if not arrived.worn:  # `attach_log` reads it
-            (check_log if arrived.is_log else check_opens)(arrived.path)
+        return good, read_worn(given), refused
     except PblError as error:
-        return error.with_key(arrived.name)
-    return None
+        return good, Sensors(), [*refused, _refusal(_names(Sensors(imu=given)), error, worn=True)]
+
+
+def _names(worn: Sensors) -> str:
+    return ", ".join({one.file: one.file.name for one in worn.imu}.values())
 
 
 def register(
-    to: Place, arrived: Sequence[tuple[Arriving, Copy]], activity: str, pace: str, by: str, segment: str = ""
+    to: Place, arrived: Sequence[tuple[Arriving, Copy]], worn: Sensors, activity: str, pace: str, by: str
 ) -> list[Received] | None:
-    """Register files that arrived whole; a sensor log goes with the video of its name, that of a wearable sensor on a
-    segment with the visit. One outcome for each video and each log without a video; None, with nothing done, while the
-    drop folder is being taken over or a person removed.
+    """Register files that were checked; a sensor log goes with the video of its name, those of wearable sensors
+    with the visit, all together. One outcome for each video, each log without a video, and all wearable sensors; None,
+    with nothing done, while the drop folder is being taken over or a person removed.
 
-    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., FILE_UNWRITABLE.
+    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., STORE_..., FILE_UNWRITABLE.
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
@@ -132,11 +153,10 @@ def register(
         place(to.session_id)  # a visit that was removed is not made again
         visit = VisitRecord(to.subject, to.label, activity=activity or None, pace=pace or None)
         for one, copy in arrived:
-            if one.worn:
-                out.append(_attach(to, one, segment))
-            elif not one.is_log:
+            if not one.is_log:
                 its_log = logs.pop(PurePosixPath(one.name).stem, None)
                 out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], by))
+    out += [_attach(to, worn, by)] if worn else []
     alone = functools.partial(
         _refused,
         found="a sensor log alone",
@@ -155,23 +175,30 @@ def register(
     return out
 
 
-def _attach(to: Place, one: Arriving, segment: str) -> Received:
-    with new_folder() as folder:
-        file = Path(shutil.move(one.path, folder / one.name))
-        try:
-            attach_log(to.session_id, file, segment)
-        except PblError as error:
-            return Received(one.name, "refused", error=error, worn=True)
-    return Received(one.name, "registered", worn=True)
+def _refusal(name: str, error: PblError, worn: bool = False) -> Received:
+    """The outcome of a file that is refused. Raises an error of this machine: the others would meet it as well."""
+    if CODES[error.code].cause == MACHINE:
+        raise error
+    return Received(name, "refused", error=error.with_key(name), worn=worn)
+
+
+def _attach(to: Place, worn: Sensors, by: str) -> Received:
+    name = _names(worn)
+    try:
+        done = attach_worn(to.session_id, worn)
+    except PblError as error:
+        return _refusal(name, error, worn=True)
+    if done:
+        segments = sorted(one.segment or "" for one in worn.imu)
+        record("sensors", by, {}, {}, {"sensors": segments}, session_id=to.session_id)
+    return Received(name, "registered" if done else "known", worn=True, note=joined(done, "; "))
 
 
 def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Received:
     try:
         result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
-        if CODES[error.code].cause == MACHINE:  # the others would meet it as well
-            raise
-        return Received(name, "refused", error=error.with_key(name))
+        return _refusal(name, error)
     assert result.video_id is not None
     if result.status == "registered":
         record("recording", by, {}, {}, {"recording": "registered"}, video_id=result.video_id)

@@ -30,12 +30,11 @@ from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
-from pbl_pipeline.sensors import Given, named, read_given
+from pbl_pipeline.sensors import Given, SensorLog, read_given
 from pbl_pipeline.video import read_first, read_phone_log
 from pbl_schemas import video, worker
 from pbl_schemas.connection import dj
 from pbl_schemas.intake import OneCamera, Registered, Sensors, VisitRecord, register
-from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
 from pbl_schemas.operations.archive import (
     COPIES,
@@ -68,7 +67,7 @@ KEPT_FREE = 10**9
 _BLOCK = 2**20
 multiprocessing.set_forkserver_preload(["pbl_pipeline.video"])  # for the processes that open files (`limited`)
 #: Errors of the installation, which end a run: other uploads would meet them as well.
-_OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
+_OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE", "STORE_FULL")
 
 
 @dataclasses.dataclass
@@ -99,7 +98,7 @@ def import_uploads(
 
     Returns None if another process is importing.
 
-    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE.
+    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_....
     Uploads that were not imported until then stay in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
@@ -285,25 +284,27 @@ def check_log(path: Path) -> None:
     _within_limits(read_phone_log, path, LOG_S, LOG_BYTES)
 
 
-def attach_log(session_id: int, file: Path, segment: str) -> list[str]:
-    """Attach the log of a wearable sensor, which is read in a process with limits, to a visit; returns its segments.
-    `segment`: "" where the names of the sensors in it tell them.
+def sensors_of(file: Path, segment: str) -> list[Given]:
+    """Return the wearable sensors that a log is of. `segment`: "" where their names in it tell them. Raises `PblError`
+    as `read_worn`."""
+    return [Given(file, log.segment, log.name) for log in _read_logs([Given(file, segment or None)])]
 
-    Raises `PblError` USAGE without a recording; what `read_given` raises; MACHINE_SHORT.
-    """
-    one = Given(file, segment or None)
+
+def read_worn(given: Sequence[Given]) -> Sensors:
+    """Read logs of wearable sensors together (`Sensors.read`), in a process with limits. Raises what that raises;
+    MACHINE_SHORT."""
+    return Sensors(imu=given).read(_read_logs)[0]
+
+
+def _read_logs(given: Sequence[Given]) -> tuple[SensorLog, ...]:
+    return _within_limits(read_given, given, LOG_S, LOG_BYTES, returns=True) if given else ()
+
+
+def _within_limits(
+    read: Callable[[Any], object], file: Path | Sequence[Given], seconds: float, n_bytes: int, returns: bool = False
+) -> Any:
     try:
-        _within_limits(read_given, [one], LOG_S, LOG_BYTES)
-        worn = named(one)
-        attach_worn(session_id, worn)
-    except PblError as error:
-        raise error.with_key(file.name) from error
-    return [sensor.segment for sensor in worn if sensor.segment]
-
-
-def _within_limits(read: Callable[[Any], object], file: Path | Sequence[Given], seconds: float, n_bytes: int) -> None:
-    try:
-        limited(read, file, seconds=seconds, n_bytes=n_bytes)
+        return limited(read, file, seconds=seconds, n_bytes=n_bytes, returns=returns)
     except LimitExceeded as error:
         raise PblError(
             "MACHINE_SHORT",

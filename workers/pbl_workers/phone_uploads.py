@@ -15,16 +15,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.temporary import new_folder
 from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
-from pbl_schemas.intake import VisitRecord, phone_recordings
+from pbl_schemas.intake import Sensors, VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, attach_log, check_log, check_opens, check_room, keep_free, register_copies
+from .incoming import Copy, check_log, check_opens, check_room, keep_free, read_worn, register_copies, sensors_of
 from .registry import FIRST
 
 
@@ -154,12 +153,14 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     return result.video_id
 
 
-def attach_worn(phone: Phone, name: str, segment: str, body: bytes) -> list[str]:
-    """Attach the log of a wearable sensor to the phone's visit, as `attach_log`."""
-    with new_folder() as folder:
-        file = folder / plain_name(name)
-        file.write_bytes(body)
-        return attach_log(phone.session_id, file, segment)
+def read_log(folder: Path, name: str, segment: str, body: bytes) -> Sensors:
+    """Write the log of a wearable sensor to a folder and read it there. Raises `PblError` as `read_worn`; OSError."""
+    file = folder / plain_name(name)
+    file.write_bytes(body)
+    try:
+        return read_worn(sensors_of(file, segment))
+    except PblError as error:
+        raise error.with_key(file.name) from error
 
 
 def discard(phone: Phone, sent: Sent) -> None:

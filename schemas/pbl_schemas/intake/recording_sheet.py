@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.progress import track
-from pbl_pipeline.sensors import given_sensors, named
+from pbl_pipeline.sensors import Given, given_sensors, named
 from pbl_pipeline.video import recorded_utc
 
 from .. import lab, session
@@ -66,38 +65,41 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     _check_people(visits, lines)
     new: list[tuple[Row, Line, OneCamera]] = []
     seen: dict[str, str] = {}
-    worn: dict[tuple[str, str], str] = {}
-    with ExitStack() as copies:
-        for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
-            if "file" not in row.cells:
+    worn: dict[tuple[str, str], tuple[set[Given], str]] = {}
+    for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
+        if "file" not in row.cells:
+            continue
+        with line.about():  # the file also of a row that is refused: all errors are found together
+            one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
+            one.read()
+            one.sensors.remove_copies()  # those of all rows need not fit on the disk
+            sha256, file = one.files[0].sha256, row.cells["file"]
+            if (first := seen.setdefault(sha256, row.where)) != row.where:
+                with line.about():
+                    raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
+            if visit is None or line.errors:
+                one.complete(chosen)
                 continue
-            with line.about():  # the file also of a row that is refused: all errors are found together
-                one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
-                one.read()
-                copies.callback(one.sensors.remove_copies)
-                sha256, file = one.files[0].sha256, row.cells["file"]
-                if (first := seen.setdefault(sha256, row.where)) != row.where:
-                    with line.about():
-                        raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
-                if visit is None or line.errors:
-                    one.complete(chosen)
-                    continue
-                _check_day(one, line)
-                if text := row.cells.get("imu"):
-                    key = visit.subject, visit.session_label
-                    check_same(worn.setdefault(key, text), text, "imu", ", ".join(key), "one list of all its sensors")
-                if known := registered(one.files):
-                    _check_place(one, known)
-                    line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
-                else:
-                    one.complete(chosen)
-                    new.append((row, line, one))
-                    line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
-        done = not dry_run and not any(line.errors for line in lines)
-        if done and new:
-            made = insert_new([one for *_, one in new], chosen)
-            for (row, line, _), result in zip(new, made, strict=True):
-                line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
+            _check_day(one, line)
+            if one.sensors.imu:
+                key, text = (visit.subject, visit.session_label), row.cells["imu"]
+                stated = {replace(given, file=given.file.resolve()) for given in one.sensors.imu}
+                before, other = worn.setdefault(key, (stated, text))
+                if before != stated:
+                    check_same(other, text, "imu", ", ".join(key), "one list of all its sensors")
+            if known := registered(one.files):
+                _check_place(one, known)
+                line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
+                line.kept += ", without the sensor files of this row: pbl ingest FILE --imu ..." if one.sensors else ""
+            else:
+                one.complete(chosen)
+                new.append((row, line, one))
+                line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
+    done = not dry_run and not any(line.errors for line in lines)
+    if done and new:
+        made = insert_new([one for *_, one in new], chosen)
+        for (row, line, _), result in zip(new, made, strict=True):
+            line.changes = [f"{row.cells['file']}: video_id {result.video_id}: registered ({result.note})"]
     return Imported(lines, done)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, joined, said
 from pbl_pipeline.files import sha256_of, zipped
 from pbl_pipeline.names import check_label
 from pbl_pipeline.records import number
@@ -60,28 +60,39 @@ class Sensors:
         """True if a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
-    def read(self) -> tuple[Sensors, PhoneLog | None]:
+    def read(self, read_sensors: Callable[..., Any] | None = None) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
         FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
-        USAGE as `read_given`; USAGE for a name that cannot be kept; STORE_FULL: no room for the zip of a folder.
+        USAGE as `read_given` (or `read_sensors`, in its place); USAGE for a name that cannot be kept; STORE_FULL: no
+        room for the zip of a folder.
         """
-        from pbl_pipeline.depth import check_recording, pack
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
-        files = [("attitude", self.attitude), ("depth", self.depth and self.depth.file)]
-        files += [("imu", given.file) for given in self.imu]
-        there = list(dict.fromkeys((prefix, path) for prefix, path in files if path and str(path) != NONE))
-        for prefix, path in there:
+        for prefix, path in self._there():
             check_label(f"name of the {_KINDS[prefix]}", path.name, 255)
             if prefix != "attitude" and not path.is_dir():
                 _check_there(path)
-        logs = iter(read_given([given for given in self.imu if given.segment is not None]))
+        logs = iter((read_sensors or read_given)([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
+        return dataclasses.replace(self, imu=imu, kept={}).packed(), log
+
+    def _there(self) -> list[tuple[str, Path]]:
+        files = [("attitude", self.attitude), ("depth", self.depth and self.depth.file)]
+        files += [("imu", given.file) for given in self.imu]
+        return list(dict.fromkeys((prefix, path) for prefix, path in files if path and str(path) != NONE))
+
+    def packed(self) -> Sensors:
+        """These files, which were read, with what is kept of them; themselves while their copies are there. Raises
+        `PblError` as `read`."""
+        from pbl_pipeline.depth import check_recording, pack
+
         kept: dict[tuple[str, Path], Kept] = {}
-        room = None
+        there, room = self._there(), None
+        if len(self.kept) == len(there) and (self.room is None or self.room.path.exists()):
+            return self
         try:
             room = new_folder() if any(path.is_dir() for _, path in there) else None
             if self.depth is not None and ("depth", self.depth.file) in there:
@@ -95,7 +106,7 @@ class Sensors:
         finally:
             if room and len(kept) < len(there):
                 room.cleanup()
-        return dataclasses.replace(self, imu=imu, kept=kept, room=room), log
+        return dataclasses.replace(self, kept=kept, room=room)
 
     def remove_copies(self) -> None:
         """Remove the zips of folders."""
@@ -119,17 +130,13 @@ def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
     return done + _attach_sensors(key, given.imu, given.kept)
 
 
-def attach_worn(session_id: int, given: Sequence[Given]) -> list[str]:
-    """Attach logs of wearable sensors to a visit that has a video; returns it in words. Raises `PblError` USAGE without
-    a video, what `Sensors.read` and `fit.check_sensors` raise."""
+def attach_worn(session_id: int, worn: Sensors) -> list[str]:
+    """Attach logs of wearable sensors, which were read, to a visit that has a video; returns it in words. Raises
+    `PblError` USAGE without a video, what `keep_files` and `fit.check_sensors` raise."""
     videos = (video.Video & {"session_id": session_id}).to_arrays("video_id")
     if not len(videos):
         raise usage("sensors of a visit without a recording", "at least one recording", next_step="film first")
-    worn, _ = Sensors(imu=given).read()
-    try:
-        return attach_now(int(min(videos)), worn)
-    finally:
-        worn.remove_copies()
+    return attach_now(int(min(videos)), worn)
 
 
 def attach_now(video_id: int, worn: Sensors) -> list[str]:
@@ -219,7 +226,8 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
             if sha256 in (None, row["imu_sha256"]) or (segments and not left):
                 (video.WearableImu & this).delete(prompt=False)
             elif left != segments:
-                video.WearableImu.update1({**this, "imu_segments": left})
+                still = {s: m for s, m in (row["imu_mounts"] or {}).items() if s in left}
+                video.WearableImu.update1({**this, "imu_segments": left, "imu_mounts": still or None})
             worn |= left != segments or (sha256 is None and bool(segments))
             replaced += [row["imu_name"]] if left != segments and row["imu_sha256"] != sha256 else []
         if sha256 is None:
@@ -228,14 +236,16 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
         about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
         _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
-        where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
-        instead = f" instead of {', '.join(replaced)}" if replaced else ""
-        done.append(f"wearable IMU file {file.name} was attached{instead}, {where}")
+        where = "kept and not read: no segment of the body is known"
+        where = said("sensors on {segments}", segments=joined(sorted(own))) if own else where
+        instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else ""
+        told = {"name": file.name, "instead": instead, "where": where}
+        done.append(said("wearable IMU file {name} was attached{instead}, {where}", **told))
         worn |= bool(own)
     if worn:
         done += fit.check_sensors(visit)
         if rows := counted(fit.delete_sensor_fits(visit)):
-            done.append(f"what was fitted without them was deleted: {rows}")
+            done.append(said("what was fitted without them was deleted: {rows}", rows=rows))
     return done
 
 

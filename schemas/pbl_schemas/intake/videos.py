@@ -236,7 +236,12 @@ class OneCamera(Recording):
             self.files = (dataclasses.replace(file, camera=_camera(self.visit.camera_file, file.path)),)
 
     def insert(self, numbers: Sequence[int]) -> list[str]:
-        return ["; ".join(attach(numbers[0], self.sensors, self.log))]
+        sensors = self.sensors.packed()  # a sheet removed the copies when it had read them
+        try:
+            return ["; ".join(attach(numbers[0], sensors, self.log))]
+        finally:
+            if sensors is not self.sensors:
+                sensors.remove_copies()
 
 
 def _camera(camera_file: str | Path, path: Path) -> dict[str, Any] | None:

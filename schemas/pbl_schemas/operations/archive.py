@@ -106,11 +106,15 @@ def has_row(target: Path) -> bool:
 
 def _placed(archive: Path, note: Path) -> tuple[Path, list[Path]]:
     """Return the place of a note's recording; and it and its sensor log, as far as they are there and not another
-    recording's."""
-    target = archive / note.parent.name / os.fsdecode(note.read_bytes())
+    recording's; of a note of another place, only itself."""
+    own = archive / note.parent.name
+    where = Path(os.fsdecode(note.read_bytes()))
+    target = own / where
+    if target.parent.parent != own or ".." in where.parts:
+        return note, []
     beside = [p for p in target.parent.glob(f"{glob.escape(target.stem)}.*") if p.stem == target.stem and p != target]
-    own = [] if any(has_row(p) or (note.parent / f"{p.name}{_PLACED}").exists() for p in beside) else beside
-    return target, [path for path in (target, *own) if path.is_file()]
+    logs = [] if any(has_row(p) or (note.parent / f"{p.name}{_PLACED}").exists() for p in beside) else beside
+    return target, [path for path in (target, *logs) if path.is_file()]
 
 
 def _begun(archive: Path) -> list[Path]:

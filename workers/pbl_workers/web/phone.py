@@ -25,14 +25,16 @@ from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Re
 
 from pbl_pipeline import texts
 from pbl_pipeline.bounded import parse_json
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, joined
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
+from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.words import capital
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_HOURS, MOST_LOG_BYTES, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import steps_of
+from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.operations.archive import UNFINISHED_DAYS
 from pbl_schemas.reading.usable import PENDING, Next, Usable, next_pass, usual_seconds
 from pbl_schemas.reading.visit_state import RESULTS, state_of
@@ -200,11 +202,14 @@ async def worn(request: Request) -> Response:
     name, segment = unquote(headers.get("x-name", "")), headers.get("x-segment", "")
     if segment not in ("", *SEGMENTS):
         raise Refused("form")
-    segments = await site.ask(request, phone_uploads.attach_worn, phone, name, segment, body)
+    with new_folder() as folder:
+        given = await _on_disk(phone_uploads.read_log, folder, name, segment, body)
+        done = await site.ask(request, attach_worn, phone.session_id, given)
     with contextlib.suppress(PblError):  # others wait
         compute(request, phone.session_id, False)
     language = reader_language(request)
-    return JSONResponse({"segments": ", ".join(texts.library_words(language, segment) for segment in segments)})
+    said = texts.library_words(language, joined(done, "; ")) if done else texts.text(language, "upload.known")
+    return JSONResponse({"said": said})
 
 
 class Phones:

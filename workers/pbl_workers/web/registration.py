@@ -6,7 +6,6 @@ import asyncio
 import datetime
 import functools
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -15,6 +14,7 @@ from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.sensors import SEGMENTS
 from pbl_schemas import lab
+from pbl_schemas.intake import Sensors
 from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
@@ -92,7 +92,7 @@ async def upload(request: Request) -> Response:
 def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Received]) -> Response:
     from pbl_pipeline.gait import ACTIVITIES, PACES
 
-    values = {"activity": "walking", "pace": "", **values}
+    values = {"activity": "walking", "pace": "", "segment": "", **values}
     more = {"choices": {"activity": ACTIVITIES, "pace": PACES}, "accepted": ", ".join(VIDEO_ENDINGS)}
     more["segments"] = SEGMENTS
     return pages.show(request, "upload.html", to=to, values=values, outcomes=outcomes, **more)
@@ -108,40 +108,33 @@ async def send(request: Request) -> Response:
     arriving: list[Arriving] = []
     try:
         fields, outcomes, whole = await _receive(request, to, arriving)
-        stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace", "segment")}
-        if stated["segment"] not in ("", *SEGMENTS):
+        stated = {name: fields[name][:100] for name in ("activity", "pace", "segment") if name in fields}
+        if (segment := stated.get("segment", "")) not in ("", *SEGMENTS):
             raise Refused("form")
-        good = []
-        videos = {Path(one.name).stem for one, _ in whole if not one.is_log}
-        for one, copy in whole:
-            # A log alone is refused as such.
-            alone = one.is_log and Path(one.name).stem not in videos
-            error = None if alone else await _on_disk(browser_uploads.check, one)
-            if error is None:
-                good.append((one, copy))
-            else:
-                outcomes.append(Received(one.name, "refused", error=error))
+        good, worn, refused = await _on_disk(browser_uploads.check, whole, segment)
+        outcomes += refused
         if not whole and not outcomes:
             outcomes.append(Received("", "refused", error=_no_file()))
-        outcomes += await taken_in(request, to, good, stated)
+        outcomes += await taken_in(request, to, good, worn, stated)
     finally:
         for one in arriving:
             await asyncio.to_thread(one.discard)
-    if all(one.status == "registered" for one in outcomes):
+    if all(one.status == "registered" and not one.note for one in outcomes):
         return RedirectResponse(f"/visits/{to.session_id}", 303)
     return upload_page(request, to, stated, outcomes)
 
 
 async def taken_in(
-    request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
+    request: Request, to: Place, good: list[tuple[Arriving, Copy]], worn: Sensors, stated: Mapping[str, str]
 ) -> list[Received]:
-    for _ in range(int(_WAIT_S) if good else 0):
-        said = stated["activity"], stated["pace"], sender(request), stated["segment"]
-        done = await site.ask(request, browser_uploads.register, to, good, *said)
+    for _ in range(int(_WAIT_S) if good or worn else 0):
+        said = stated.get("activity", ""), stated.get("pace", ""), sender(request)
+        done = await site.ask(request, browser_uploads.register, to, good, worn, *said)
         if done is not None:
             return done
         await asyncio.sleep(1.0)
-    return [Received(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
+    names = [one.name for one, _ in good] + [one.file.name for one in worn.imu]
+    return [Received(name, "refused", error=_busy(key=name)) for name in dict.fromkeys(names)]
 
 
 ROUTES = [

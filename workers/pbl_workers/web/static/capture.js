@@ -229,7 +229,7 @@ $(".worn input").onchange = async () => {
     const line = item(file.name, t("sending", { n: 0 }));
     lines.prepend(line);
     const said = await request("/phone/sensors.json", { method: "POST", headers, body: file }).then(
-      (told) => `\u2713 ${told.segments}`, (error) => (error instanceof Refusal ? `${error.message}; ${error.expected}` : t("no_network")));
+      (told) => `\u2713 ${told.said}`, (error) => (error instanceof Refusal ? `${error.message}; ${error.expected}` : t("no_network")));
     line.replaceWith(item(file.name, said));
   }
   input.value = "";
