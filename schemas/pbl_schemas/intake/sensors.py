@@ -239,8 +239,11 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
         where = "kept and not read: no segment of the body is known"
         where = said("sensors on {segments}", segments=joined(sorted(own))) if own else where
         instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else ""
-        told = {"name": file.name, "instead": instead, "where": where}
-        done.append(said("wearable IMU file {name} was attached{instead}, {where}", **told))
+        done.append(
+            said(
+                "wearable IMU file {name} was attached{instead}, {where}", name=file.name, instead=instead, where=where
+            )
+        )
         worn |= bool(own)
     if worn:
         done += fit.check_sensors(visit)
