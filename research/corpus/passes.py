@@ -247,6 +247,9 @@ def main(
                 f"{len(done)} of {len(seen)} sessions, {method.key}: seen at {ready - begin:.0f} s, "
                 f"fitted {time.perf_counter() - ready:.0f} s"
             )
+            for s, failed in zip(seen, fits, strict=True):
+                if isinstance(failed, PblError):
+                    click.echo(f"{s.cases[0].walk.person}, {s.kind} {s.number}: {failed.code}, {failed.found}")
             if before is not None:
                 keep(*before)
             before = first, pool.starmap_async(rows_of, done, chunksize=4)
