@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# pingouin's reliability of one rating is that of a mean if a rater rated more than once, and gaps in repeats are no gaps.
+# pingouin's reliability of one rating is that of a mean if a rater rated more than once, and gaps in repeats do not count.
 #
 # Seen 2026-11-29: pingouin 0.7.0, pandas 3.1.1, numpy 2.4.6.
 # Behaviour: `intraclass_corr` takes the mean of all rows of a target and rater. With nine walks a visit, ICC(A,1), by its

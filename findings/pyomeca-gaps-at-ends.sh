@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# pyomeca fills what is missing at the ends of a recording with zeros, and normalises the times of what it was given.
+# pyomeca fills gaps at the ends of a recording with zeros, and normalises the times of its argument in place.
 #
 # Seen 2026-11-29: pyomeca 2026.0.2, xarray 2026.9.0, numpy 2.4.6.
 # Behaviour: `interpolate_missing_data` joins gaps within a recording by lines; before the first and after the last sample

@@ -249,7 +249,7 @@ def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
     return rows
 
 
-#: What a builder begins with, if not an empty database.
+#: The older database on which each of these is built; the others begin with an empty one.
 BASES: dict[Callable[[Path], Any], Callable[[Path], Any]] = {without_instruments: new, one_visit: new}
 BASES |= dict.fromkeys((two_visits, without_sizes, corrected_by_a_method), one_visit)
 BASES |= dict.fromkeys((without_session, tracked_without_video_info, stated_in_words), two_visits)

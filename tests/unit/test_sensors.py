@@ -103,7 +103,7 @@ def test_clock_and_mounting_are_found(truth, seen, stated):
 
 
 def test_a_stated_mounting_starts_the_pelvis_and_must_not_contradict_gravity(truth, seen):
-    """Also where there is no acceleration: the walking direction is not needed."""
+    """Also without acceleration: the walking direction is not needed."""
     logs, mounts = synthetic.worn(truth, 3, ("pelvis",), clock_s=0.1)
     given = oriented(logs[0]).at(logs[0].time)[0]
     alone = dataclasses.replace(logs[0], rate=None, acceleration=None, orientation=given)
