@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import uvicorn
 from starlette.testclient import TestClient
@@ -76,11 +77,8 @@ def one_query_at_a_time() -> Iterator[None]:
         with waiting:
             execute(*args)
 
-    connection._execute_query = alone
-    try:
+    with mock.patch.object(connection, "_execute_query", alone):
         yield
-    finally:
-        del connection._execute_query
 
 
 @contextlib.contextmanager
@@ -89,12 +87,13 @@ def running(app: Any, where: Where) -> Iterator[int]:
     listening = socket.create_server((where.host, 0))
     server = uvicorn.Server(config(app, where))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    thread.start()
-    try:
-        yield listening.getsockname()[1]
-    finally:
-        server.should_exit = True
-        thread.join(10)
+    with one_query_at_a_time():
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join(10)
 
 
 @contextlib.contextmanager
@@ -114,10 +113,9 @@ def shown(
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
         opened.goto(f"/enter?key={app.state.site.sessions.new_link(name, *role.split(','))}")
-        with one_query_at_a_time():
-            try:
-                yield opened
-            except BaseException:  # pytest shows what a failed test has printed
-                sys.stdout.write("\n".join([opened.url, *errors, opened.inner_text("body")]))
-                raise
+        try:
+            yield opened
+        except BaseException:  # pytest shows what a failed test has printed
+            sys.stdout.write("\n".join([opened.url, *errors, opened.inner_text("body")]))
+            raise
         assert not [e for e in errors if not (refused and "a status of 4" in e)]
