@@ -6,7 +6,7 @@
 #   "forward_velocity") and counts the events from there. Its threshold of velocity is in m/s for a TRC in m; for one in mm
 #   it is multiplied by a thousand, and so are the positions: 1 mm/s remains. Contacts are not found, or 150 ms short at
 #   each end.
-# Matters: both contacts of a step are 33 ms early at 30 frames a second, so that times of stance hide it, and forces or
+# Matters: begin and end of a contact are 33 ms early at 30 frames a second, so that the time of stance hides it, and forces or
 #   other sensors do not fit. TRC of OpenSim and our exports are in mm.
 
 # shellcheck disable=SC1091 # _common.sh is checked by itself

@@ -3,8 +3,8 @@
 #
 # Seen 2026-11-30: pyedflib 0.1.42, numpy 2.4.6.
 # Behaviour: the file has no count of samples, only of blocks, whose length is sought so that they hold a whole number of
-#   samples: 1 s at 60 Hz, 50 s at 59.94 Hz, 9.1 s at 1111.11 Hz. What the last block lacks is filled with the physical
-#   minimum of the channel, or 0 if it can hold that, and read back as data. The docstrings do not mention it.
+#   samples: 1 s at 60 Hz, 50 s at 59.94 Hz, 9.1 s at 1111.11 Hz. The rest of the last block is the physical
+#   minimum of the channel, or 0 if it can hold that, and is read back as data. The docstrings do not mention it.
 # Matters: 60 s of an accelerometer beside a camera of 59.94 Hz come back as 100 s, and their mean, range and last steps
 #   are others. Keep the number of samples elsewhere.
 
