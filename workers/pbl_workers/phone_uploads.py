@@ -17,13 +17,13 @@ from pathlib import Path
 from pbl_pipeline.errors import PblError
 from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
-from pbl_schemas.intake import Sensors, VisitRecord, phone_recordings
+from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders, unfinished
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_log, check_opens, check_room, keep_free, read_worn, register_copies, sensors_of
+from .incoming import Copy, check_log, check_opens, check_room, keep_free, register_copies
 from .registry import FIRST
 
 
@@ -151,16 +151,6 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)
     phone_recordings.received(sent.number, result.video_id)
     return result.video_id
-
-
-def read_log(folder: Path, name: str, segment: str, body: bytes) -> Sensors:
-    """Write the log of a wearable sensor to a folder and read it there. Raises `PblError` as `read_worn`; OSError."""
-    file = folder / plain_name(name)
-    file.write_bytes(body)
-    try:
-        return read_worn(sensors_of(file, segment))
-    except PblError as error:
-        raise error.with_key(file.name) from error
 
 
 def discard(phone: Phone, sent: Sent) -> None:

@@ -47,13 +47,14 @@ _LONGEST = 980
 
 @dataclasses.dataclass(frozen=True)
 class Phone:
-    """A phone that may film for a visit by its link."""
+    """A phone that may film for a visit by its link. by: who made that."""
 
     link: int
     session_id: int
     subject: str
     label: str
     expires: datetime.datetime
+    by: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,8 +153,8 @@ def phone_of(cookie: str) -> Phone:
     """Return the phone with a cookie. Raises `PblError` PHONE_LINK if its link has ended or never was."""
     link = _valid(PhoneLink & {"link_phone_sha256": hashed(cookie)})
     visit = (session.Session & {"session_id": link["session_id"]}).fetch1()
-    number = int(link["session_id"])
-    return Phone(int(link["phone_link"]), number, visit["subject"], visit["session_label"], link["link_expires"])
+    where = int(link["session_id"]), visit["subject"], visit["session_label"]
+    return Phone(int(link["phone_link"]), *where, link["link_expires"], link["link_by"])
 
 
 def hashed(secret: str) -> str:

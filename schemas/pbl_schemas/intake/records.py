@@ -164,6 +164,7 @@ class Recording:
 
     visit: VisitRecord
     files: tuple[File, ...] = ()  # what `read` read
+    sensors: Any = None  # `Sensors` of videos
     markers: ClassVar[bool] = False  # whether it goes straight to the fit, without tracking and keypoints
 
     @property
