@@ -37,6 +37,7 @@ _DIRECTIONS = {
 }
 #: Sensors of one recording whose logs overlap by less than this share are not of one recording.
 _OVERLAP = 0.5
+_TOGETHER = "name all logs of one recording together; `pbl ingest FILE --imu none` takes older ones away"
 #: Reads the sensors in a file: `read_samples`, or what remembers them (`functools.cache`).
 Read = Callable[[Path, float | None, str | None], Sequence[Samples]]
 
@@ -103,8 +104,8 @@ def given_sensors(text: str, folder: Path = Path()) -> list[Given]:
 
 def _known(segment: str) -> str:
     if segment not in SEGMENTS:
-        found = said("a sensor on {segment}", segment=segment)
-        raise PblError("USAGE", found, ", ".join(SEGMENTS), "name one of these segments")
+        unknown = said("a sensor on {segment}", segment=segment)
+        raise PblError("USAGE", unknown, ", ".join(SEGMENTS), "name one of these segments")
     return segment
 
 
@@ -169,35 +170,21 @@ def read_given(given: Sequence[Given], read: Read = read_samples) -> tuple[Senso
     Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples` and `checked`, and for logs that are not of one
     recording; USAGE: a segment or a sensor is named twice, or the one of a file is not known.
     """
-    found = sensors_in(given, read)
-    values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
-    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
-    for i, (segment, samples, one) in enumerate(found):
-        before = zip(found[:i], measured, strict=False)
-        if same := [w for (s, _, w), m in before if s == segment or (m and m == measured[i])]:
-            names = {"name": samples.name, "file": one.shown.name, "other": same[0].shown.name}
-            about = "the sensor {name} on {segment}: one of them twice ({file}, {other})"
-            twice = said(about, segment=as_said(segment), **names)
-            raise PblError("USAGE", twice, "one sensor on each segment", "name each sensor once")
+    found = once(sensors_in(given, read))
     clocks = {x.clock: w.shown.name for _, x, w in found}
     if len(clocks) > 1:
         named = ", ".join(f"{clock} ({file})" for clock, file in sorted(clocks.items()))
-        raise log_error(
-            said("sensors on different clocks: {clocks}", clocks=named),
-            "sensors that were synchronised in one recording",
-            key=found[0][2].shown,
-        )
+        apart = said("sensors on different clocks: {clocks}", clocks=named)
+        expected = "sensors that were synchronised in one recording"
+        raise log_error(apart, expected, next_step=_TOGETHER, key=found[0][2].shown)
     found = [(segment, _mounted(_unwrapped(x, found[0][1]), g), g) for segment, x, g in found]
     begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
     logs = tuple(checked(x, segment, w.shown, begin) for segment, x, w in found)
-    by_start = sorted(range(len(logs)), key=lambda i: logs[i].time[0])
-    by_end = sorted(range(len(logs)), key=lambda i: logs[i].time[-1])
-    if logs and (s := logs[by_end[0]].time[-1] - logs[by_start[-1]].time[0]) < _OVERLAP * min(
-        x.time[-1] - x.time[0] for x in logs
-    ):
-        a, b = (found[i][2].shown.name for i in (by_end[0], by_start[-1]))
-        common = said("logs {a} and {b}, which have {s:.3g} s in common", a=a, b=b, s=max(s, 0.0))
-        raise log_error(common, "sensors of one recording", key=found[0][2].shown)
+    spans = [(x.time[-1], x.time[0], w.shown.name) for x, (_, _, w) in zip(logs, found, strict=True)]
+    first, last = (min(spans), max(spans, key=lambda span: span[1])) if spans else ((0.0, 0.0, ""),) * 2
+    if (s := first[0] - last[1]) < _OVERLAP * min((end - start for end, start, _ in spans), default=0.0):
+        common = said("logs {a} and {b}, which have {s:.3g} s in common", a=first[2], b=last[2], s=max(s, 0.0))
+        raise log_error(common, "sensors of one recording", next_step=_TOGETHER, key=found[0][2].shown)
     return logs
 
 
@@ -223,6 +210,20 @@ def sensors_in(given: Sequence[Given], read: Read = read_samples) -> list[tuple[
     wanted = {(g.file, g.rate_hz, g.called) for g in given}
     files = {one: read(*one) for one in sorted(wanted, key=str)}
     return [(*pair, g) for g in given for pair in _chosen(g, files[g.file, g.rate_hz, g.called])]
+
+
+def once(found: list[tuple[str, Samples, Given]]) -> list[tuple[str, Samples, Given]]:
+    """Return what `sensors_in` found. Raises `PblError` USAGE if a segment or a sensor is in it twice."""
+    values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
+    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
+    for i, (segment, samples, one) in enumerate(found):
+        before = zip(found[:i], measured, strict=False)
+        if same := [w for (s, _, w), m in before if s == segment or (m and m == measured[i])]:
+            names = {"name": samples.name, "file": one.shown.name, "other": same[0].shown.name}
+            about = "the sensor {name} on {segment}: one of them twice ({file}, {other})"
+            twice = said(about, segment=as_said(segment), **names)
+            raise PblError("USAGE", twice, "one sensor on each segment", "name each sensor once")
+    return found
 
 
 def named(one: Given, read: Read = read_samples) -> list[Given]:

@@ -870,7 +870,7 @@ def test_logs_of_wearable_sensors_are_one_set(visit: int, tmp_path: Path):
     assert "no known format" in found[none.name][1]
     assert "right shank" in found[both][1]
     decision = Decision.fetch1()
-    assert (decision["decision_what"], decision["decision_by"]) == ("sensors", "You")
+    assert (decision["decision_what"], decision["decision_by"]) == ("sensors", "R. Viewer")
     assert (decision["decision_after"], decision["decision_about"]) == (
         {"sensors": ["shank_r", "thigh_l"]},
         {"phone_link": 1},

@@ -70,9 +70,9 @@ class Sensors:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
         FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
-        USAGE as `sensors_in`; USAGE for a name that cannot be kept; STORE_FULL: no room for the zip of a folder.
+        USAGE as `sensors_in`, `once`; USAGE for a name that cannot be kept; STORE_FULL: no room to zip a folder.
         """
-        from pbl_pipeline.sensors import read_samples, sensors_in
+        from pbl_pipeline.sensors import once, read_samples, sensors_in
         from pbl_pipeline.video import read_phone_log
 
         for prefix, path in self._there():
@@ -80,7 +80,7 @@ class Sensors:
             if prefix != "attitude" and not path.is_dir():
                 _check_there(path)
         samples = self.samples or functools.cache(read_samples)
-        found = iter(sensors_in([given for given in self.imu if given.segment is not None], samples))
+        found = iter(once(sensors_in([given for given in self.imu if given.segment is not None], samples)))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(found)[1].name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
         return dataclasses.replace(self, imu=imu, kept={}, samples=samples).packed(), log

@@ -177,6 +177,11 @@ def refused(request: Request, reason: str) -> Response:
 
 
 def error(request: Request, error: PblError, status: int) -> Response:
+    if as_json(request) and getattr(request.state, "phone", None) is not None:  # its page shows these words
+        parts = (
+            texts.on_page(reader_language(request), part) for part in (error.found, error.expected, error.next_step)
+        )
+        error = PblError(error.code, *(part.striptags() for part in parts), error.key)
     return show(request, "error.html", status, error=error)
 
 

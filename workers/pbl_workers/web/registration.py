@@ -105,7 +105,8 @@ def words(language: str, one: Received) -> Markup:
         return escape(texts.text(language, "upload.photo"))
     if not one.worn and (name := f"upload.{one.error.code}") in texts.catalogue():
         return Markup("{} ({})").format(texts.text(language, name), on_page(one.error.found))
-    return Markup("{}. {}.").format(on_page(one.error.found), capital(on_page(one.error.next_step)))
+    found, more = on_page(one.error.found), on_page(one.error.next_step, False) or on_page(one.error.next_step)
+    return Markup("{}. {}.").format(found if one.name else capital(found), capital(more.rstrip(".")))
 
 
 async def send(request: Request) -> Response:
