@@ -115,9 +115,7 @@ class Arriving:
 
 
 def check(
-    whole: Sequence[tuple[Arriving, Copy]],
-    segment: str,
-    of_visit: tuple[list[dict[str, Any]], dict[str, str | None]],
+    whole: Sequence[tuple[Arriving, Copy]], segment: str, of_visit: tuple[list[dict[str, Any]], dict[str, str | None]]
 ) -> tuple[list[tuple[Arriving, Copy]], Sensors, list[Received]]:
     """Return the files of a form that may be registered, its logs of wearable sensors, and what is refused of them, or
     could not be checked (`check_opens`, `check_log`, `read_given` of each log, `Sensors.at_visit` of all together).
