@@ -269,12 +269,9 @@ def keep_free(folder: Path, n_bytes: int) -> None:
 def check_room(n_bytes: int, next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
     if not has_room(archive_dir(), n_bytes):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
-            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step=next_step,
-        )
+        found = f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server"
+        expected = f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free"
+        raise PblError("FILE_UNWRITABLE", found, expected, next_step)
 
 
 def check_opens(path: Path) -> None:
@@ -300,13 +297,9 @@ def _within_limits(
     try:
         return limited(read, file, seconds=seconds, n_bytes=n_bytes, returns=returns)
     except LimitExceeded as error:
-        raise PblError(
-            "MACHINE_SHORT",
-            found=f"the file was not opened: {error}",
-            expected=f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory",
-            next_step="try again; if it stays so, give the server more memory, or fewer processes",
-            key=file,
-        ) from error
+        expected = f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory"
+        next_step = "try again; if it stays so, give the server more memory, or fewer processes"
+        raise PblError("MACHINE_SHORT", f"the file was not opened: {error}", expected, next_step, key=file) from error
 
 
 def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
@@ -325,7 +318,7 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
-    (result,) = register([OneCamera(target, visit, sensors)])
+    (result,) = register([OneCamera(target, visit, sensors, recording.sha256)])
     if result.error is not None:
         if has_row(target):
             note.unlink()

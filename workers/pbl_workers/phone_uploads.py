@@ -131,21 +131,14 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     visit = VisitRecord(phone.subject, phone.label, **stated)
     with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            raise PblError(
-                "DB_REFUSED",
-                found="recordings of the drop folder are being taken over",
-                expected="one import at a time",
-                next_step="the page tries again",
-            )
+            found = "recordings of the drop folder are being taken over"
+            raise PblError("DB_REFUSED", found, "one import at a time", "the page tries again")
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
         if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
             # Without the owner: the phone has the right to its own visit alone.
-            raise PblError(
-                "VIDEO_DUPLICATE",
-                found="this recording is registered in another visit",
-                expected="a recording of this visit",
-                next_step="film again; who runs the server can find and move it (`pbl move`)",
-            )
+            found = "this recording is registered in another visit"
+            next_step = "film again; who runs the server can find and move it (`pbl move`)"
+            raise PblError("VIDEO_DUPLICATE", found, "a recording of this visit", next_step)
         result = register_copies(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)

@@ -60,12 +60,9 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
         raise unknown_video(video_id)
     (row,) = rows
     if (row["subject"], row["session_label"]) == (subject, session_label):
-        raise PblError(
-            "USAGE",
-            found=f"video_id {video_id} is in {subject}/{session_label} already",
-            expected="another visit",
-            next_step="nothing is to be done",
-        )
+        expected = "another visit"
+        next_step = "nothing is to be done"
+        raise PblError("USAGE", f"video_id {video_id} is in {subject}/{session_label} already", expected, next_step)
     numbers = fit.videos_of(fit.trial_of(video_id))
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()

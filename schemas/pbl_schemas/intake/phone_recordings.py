@@ -83,19 +83,11 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
     for an unknown visit or protocol, USAGE for a time that is too long."""
     session.registered_visit(session_id)
     if protocol is not None and not Protocol & {"protocol": protocol}:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no protocol {protocol}",
-            expected="a registered protocol",
-            next_step="`pbl capture protocol NAME SHEET` registers one",
-        )
+        next_step = "`pbl capture protocol NAME SHEET` registers one"
+        raise PblError("DB_NOT_FOUND", f"no protocol {protocol}", "a registered protocol", next_step)
     if not 0 < hours <= MOST_HOURS:
-        raise PblError(
-            "USAGE",
-            found=f"a link for {hours:g} hours",
-            expected=f"more than 0 and at most {MOST_HOURS:g}",
-            next_step="make a link for each day of filming",
-        )
+        found = f"a link for {hours:g} hours"
+        raise PblError("USAGE", found, f"more than 0 and at most {MOST_HOURS:g}", "make a link for each day of filming")
     key, now = secrets.token_urlsafe(32), utc_now()
 
     def insert() -> int:
@@ -236,12 +228,9 @@ def recording(phone: Phone, number: int) -> Sent:
     """Return a recording of the phone's visit. Raises `PblError` DB_NOT_FOUND for that of another one."""
     rows = (PhoneRecording & {"phone_recording": number, "session_id": phone.session_id}).to_dicts()
     if not rows:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no recording {number} of this visit",
-            expected="a recording that this visit's phone has begun to send",
-            next_step="load the page again: it begins the upload anew",
-        )
+        found = f"no recording {number} of this visit"
+        expected = "a recording that this visit's phone has begun to send"
+        raise PblError("DB_NOT_FOUND", found, expected, "load the page again: it begins the upload anew")
     return _sent(rows[0])
 
 

@@ -143,8 +143,8 @@ class File:
     camera: Mapping[str, Any] | None = None
 
     @classmethod
-    def of(cls, path: Path) -> File:
-        """Read the bytes of a file. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
+    def of(cls, path: Path, sha256: str = "") -> File:
+        """Read the bytes of a file, unless their `sha256` is known. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
         hold."""
         from pbl_pipeline.video import check_file
 
@@ -153,7 +153,7 @@ class File:
         check_path(path)
         if not path.stat().st_size:
             raise _no_video("VIDEO_EMPTY", "0 bytes", path)
-        return cls(path, sha256_of(check_file(path)), path.stat().st_size)
+        return cls(path, sha256 or sha256_of(check_file(path)), path.stat().st_size)
 
 
 class Recording:

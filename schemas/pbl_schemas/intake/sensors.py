@@ -287,12 +287,9 @@ def _state(logs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _check_read(logs: Sequence[Mapping[str, Any]], together: Sequence[str]) -> None:
     if _state(logs) != together:
-        raise PblError(
-            "DECIDED_MEANWHILE",
-            found="other logs of wearable sensors came to this visit meanwhile",
-            expected="those that were read together with these; nothing was written",
-            next_step="do it again",
-        )
+        found = "other logs of wearable sensors came to this visit meanwhile"
+        expected = "those that were read together with these; nothing was written"
+        raise PblError("DECIDED_MEANWHILE", found, expected, "do it again")
 
 
 def read_carried(numbers: Sequence[int], subject: str, session_label: str) -> list[str]:
