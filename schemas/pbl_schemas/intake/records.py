@@ -144,8 +144,8 @@ class File:
 
     @classmethod
     def of(cls, path: Path, sha256: str = "") -> File:
-        """Read the bytes of a file, unless their `sha256` is known. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
-        hold."""
+        """Read the bytes of a file, unless their `sha256` is known. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE
+        for a path that no row can hold."""
         from pbl_pipeline.video import check_file
 
         if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
