@@ -60,9 +60,8 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
         raise unknown_video(video_id)
     (row,) = rows
     if (row["subject"], row["session_label"]) == (subject, session_label):
-        expected = "another visit"
-        next_step = "nothing is to be done"
-        raise PblError("USAGE", f"video_id {video_id} is in {subject}/{session_label} already", expected, next_step)
+        found = f"video_id {video_id} is in {subject}/{session_label} already"
+        raise PblError("USAGE", found, "another visit", "nothing is to be done")
     numbers = fit.videos_of(fit.trial_of(video_id))
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()

@@ -198,8 +198,9 @@ async def worn(request: Request) -> Response:
     phone: Phone = request.state.phone
     to = Place(phone.session_id, phone.subject, phone.label, phone.by, phone.link)
     _, outcomes = await registration.received(request, to)
-    with contextlib.suppress(PblError):  # others wait
-        compute(request, phone.session_id, False)
+    if any(one.status == "registered" for one in outcomes):
+        with contextlib.suppress(PblError):  # others wait
+            compute(request, phone.session_id, False)
     said = functools.partial(registration.words, reader_language(request))
     told = [{"name": one.name, "taken": one.error is None, "said": said(one).striptags()} for one in outcomes]
     return JSONResponse({"outcomes": told})
