@@ -58,9 +58,9 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     notes: list[str] = []
 
     def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
-        sensor = {"name": samples.name, "segment": as_said(segment), "found": as_said(found)}
-        more = {"next_step": next_step} if next_step else {}
-        raise log_error(said("sensor {name} on {segment}: {found}", **sensor), expected, key=path, **more)
+        on, more = as_said(segment), {"next_step": next_step} if next_step else {}
+        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=on, found=as_said(found))
+        raise log_error(about, expected, key=path, **more)
 
     kept = _kept(samples, notes, refuse)
     time = samples.stamp[kept]
@@ -185,11 +185,9 @@ def _check_rate(
         found = said("angular rates of up to {w:.3g}, as in deg/s", w=fastest)
         refuse(found, f"rad/s, in which a person reaches less than {_FASTEST:g}", "multiply by pi / 180")
     if 0 < factor < 0.05:
-        refuse(
-            said("angular rates of up to {w:.3g} rad/s, 1/57 of what its other values turn by", w=fastest),
-            "rates in the unit that the format states",
-            "set the unit of the program's export back to deg/s",
-        )
+        found = said("angular rates of up to {w:.3g} rad/s, 1/57 of what its other values turn by", w=fastest)
+        back = "set the unit of the program's export back to deg/s"
+        refuse(found, "rates in the unit that the format states", back)
     if not (np.isnan(factor) or 0.8 <= factor <= 1.25):
         found = said("rates that are {f:.2f} times those of its orientation", f=factor)
         refuse(found, "an orientation from the sensor's axes to a world, which turns as the rates say")
@@ -222,11 +220,9 @@ def _by_gravity(time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, re
     if off[1.0] > np.radians(3) and off[best] < 0.4 * off[1.0]:
         return best
     if against > _AGAINST_DEG:
-        refuse(
-            said("angular rates that turn gravity by {off:.0f} deg in a quarter of a second", off=against),
-            "rates and accelerations of one sensor, in the same axes: gravity keeps its direction",
-            "check the axes and signs of the gyroscope, and that it was on",
-        )
+        found = said("angular rates that turn gravity by {off:.0f} deg in a quarter of a second", off=against)
+        expected = "rates and accelerations of one sensor, in the same axes: gravity keeps its direction"
+        refuse(found, expected, "check the axes and signs of the gyroscope, and that it was on")
     return np.nan
 
 
@@ -281,8 +277,8 @@ def _unclipped(
                 clipped |= np.convolve(run, [1, 1, 1]) > 0
     share = float(clipped.mean())
     if share > _MOST_CLIPPED:
-        text = "an {what} at the end of the sensor's range in {share:.0%} of the samples"
-        found = said(text, what=said(what), share=share)
+        of = said(what)
+        found = said("an {what} at the end of the sensor's range in {share:.0%} of the samples", what=of, share=share)
         refuse(found, f"at most {_MOST_CLIPPED:.0%}", "record with a larger range")
     if clipped.any():
         notes.append(f"{what}: {int(clipped.sum())} samples at the end of the sensor's range were left out")
@@ -307,8 +303,10 @@ def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> 
             found = said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=sensor, days=off)
             next_step = "name the log of this visit, or correct the clock of the recording"
             raise log_error(found, "the log of the same visit", next_step=next_step, key=name)
-    text = "{name} states a day {off:.1f} days from the log of the sensors"
-    return [said(text, name=name, off=off) for name, (off, _) in wrong.items()]
+    return [
+        said("{name} states a day {off:.1f} days from the log of the sensors", name=name, off=off)
+        for name, (off, _) in wrong.items()
+    ]
 
 
 def places(

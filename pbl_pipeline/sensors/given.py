@@ -219,9 +219,13 @@ def once(found: list[tuple[str, Samples, Given]]) -> list[tuple[str, Samples, Gi
     for i, (segment, samples, one) in enumerate(found):
         before = zip(found[:i], measured, strict=False)
         if same := [w for (s, _, w), m in before if s == segment or (m and m == measured[i])]:
-            names = {"name": samples.name, "file": one.shown.name, "other": same[0].shown.name}
-            about = "the sensor {name} on {segment}: one of them twice ({file}, {other})"
-            twice = said(about, segment=as_said(segment), **names)
+            twice = said(
+                "the sensor {name} on {segment}: one of them twice ({file}, {other})",
+                name=samples.name,
+                segment=as_said(segment),
+                file=one.shown.name,
+                other=same[0].shown.name,
+            )
             raise PblError("USAGE", twice, "one sensor on each segment", "name each sensor once")
     return found
 
@@ -250,11 +254,11 @@ def _chosen(given: Given, samples: Sequence[Samples]) -> list[tuple[str, Samples
         ours = [x for s, x in by_name if s == given.segment] if len(samples) > 1 else samples
         pairs = [(given.segment, x) for x in ours]
     if not pairs or (given.segment is not None and len(pairs) > 1):
-        names, segment = ", ".join(x.name for x in samples)[:200], as_said(given.segment or "which segment")
-        unknown = "which sensor of {file} is on {segment} is not known: {names}"
+        names, on = ", ".join(x.name for x in samples)[:200], as_said(given.segment or "which segment")
+        file = given.shown.name
         raise PblError(
             "USAGE",
-            found=said(unknown, file=given.shown.name, segment=segment, names=names),
+            said("which sensor of {file} is on {segment} is not known: {names}", file=file, segment=on, names=names),
             expected="a sensor for each segment",
             next_step="state where it was worn; --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE of a single sensor",
             key=given.shown,

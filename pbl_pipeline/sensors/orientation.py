@@ -129,5 +129,6 @@ def input_error(found: str, expected: str, next_step: str = "check the logs of t
 
 def log_error(log: SensorLog, found: str, expected: str, *next_step: str) -> PblError:
     """Return the error FIT_INPUT about a log."""
-    sensor = {"name": log.name, "segment": as_said(log.segment), "found": as_said(found)}
-    return input_error(said("sensor {name} on {segment}: {found}", **sensor), expected, *next_step).about(log.name)
+    on = as_said(log.segment)
+    about = said("sensor {name} on {segment}: {found}", name=log.name, segment=on, found=as_said(found))
+    return input_error(about, expected, *next_step).about(log.name)

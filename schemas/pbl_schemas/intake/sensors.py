@@ -245,8 +245,9 @@ def _with(
         where = "kept and not read: no segment of the body is known"
         where = said("sensors on {segments}", segments=joined(sorted(own))) if own else where
         instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else ""
-        text = "wearable IMU file {name} was attached{instead}, {where}"
-        done.append(said(text, name=file.name, instead=instead, where=where))
+        name = file.name
+        text = said("wearable IMU file {name} was attached{instead}, {where}", name=name, instead=instead, where=where)
+        done.append(text)
         changed |= bool(own)
     return rows, done, changed
 

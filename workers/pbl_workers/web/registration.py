@@ -135,9 +135,8 @@ async def received(request: Request, to: Place) -> tuple[dict[str, str], list[Re
         good, worn, refused = await _on_disk(browser_uploads.check, whole, segment, of_visit)
         outcomes += refused
         if not whole and not outcomes:
-            worn_alone = "segment" in stated
-            nothing = PblError("USAGE", *(_NO_LOG if worn_alone else _NO_FILE))
-            outcomes.append(Received("", "refused", error=nothing, worn=worn_alone))
+            nothing = PblError("USAGE", *(_NO_LOG if "segment" in stated else _NO_FILE))
+            outcomes.append(Received("", "refused", error=nothing, worn="segment" in stated))
         outcomes += await taken_in(request, to, good, worn, stated)
     finally:
         for one in arriving:
