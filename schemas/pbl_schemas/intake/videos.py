@@ -177,7 +177,7 @@ class OneCamera(Recording):
         return self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
 
     def read(self) -> None:
-        self.files = (File.of(*self.paths, self.sha256),)  # no picture is decoded
+        self.files = (File.of(self.paths[0], self.sha256),)  # no picture is decoded
         self.sensors, self.log = self.sensors.read()
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
