@@ -311,7 +311,7 @@ def _named(tree: Iterable[ast.AST]) -> dict[str, list[ast.expr]]:
 
 
 def _parts(node: ast.Call, named: dict[str, list[ast.expr]]) -> dict[str, ast.expr]:
-    """What an error found and expected, and its next step, by name or in their places; a name is its last value."""
+    """Found, expected and next step of an error, by name or in their places; a name stands for its last value."""
     names, of = ("found", "expected", "next_step"), getattr(node.func, "id", "")
     places = node.args[1:] if of == "PblError" else node.args if of in ("refused", "_refused", "conflict") else []
     out: list[ast.expr] = []
