@@ -51,6 +51,7 @@ from .origin import Origin, computes, origin_columns
 from .plan import plan_fit_sets
 from .record_parts import part_of
 from .rows import InputChanged, MadeOnce, delete_below, inside, one
+from .store import store_errors
 from .stored_files import file_ref, read_stored, stored_file
 
 if TYPE_CHECKING:
@@ -307,7 +308,8 @@ def read_worn(
     logs: Sequence[Mapping[str, Any]], recorded: Mapping[str, str | None], read: Read | None = None
 ) -> tuple[tuple[SensorLog, ...], list[str]]:
     """Read logs as `worn_logs` returns them, or of which `imu_file` is the path of a new one, without the tables;
-    returns them, and notes on videos of another day. Raises `PblError` SENSOR_LOG, USAGE: a fit with them would fail.
+    returns them, and notes on videos of another day. Raises `PblError` SENSOR_LOG, USAGE: a fit with them would fail;
+    as `store_errors`.
     """
     from pbl_pipeline.sensors import Given, check_day, read_given, read_samples
 
@@ -316,7 +318,8 @@ def read_worn(
         for row in (row for row in logs if row["imu_segments"]):
             path, called = row["imu_file"], None
             if not isinstance(path, Path):
-                path, called = stack.enter_context(stored_file(path)), row["imu_name"]
+                with store_errors():
+                    path, called = stack.enter_context(stored_file(path)), row["imu_name"]
             mounts = row["imu_mounts"] or {}
             given += [
                 Given(path, segment, sensor or None, row["imu_rate"], called, mounts.get(segment))

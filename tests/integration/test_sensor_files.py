@@ -422,6 +422,18 @@ def test_a_store_that_takes_no_copy_is_named(tmp_path: Path, faults: Faults, err
     assert "was attached" in pbl("ingest", two, "--subject", "P001", "--imu", given).out
 
 
+def test_a_store_that_does_not_answer_is_named_also_before_the_transaction(tmp_path: Path, faults: Faults):
+    path, away = chain.small_video(tmp_path, "a"), type("ConnectTimeoutError", (Exception,), {"__module__": "botocore"})
+    shank, thigh = (
+        worn_sensor.apdm({name: Swing(phase=i)}, tmp_path / f"{name}.csv")
+        for i, name in enumerate(("Right Ankle", "Right Thigh"))
+    )
+    assert pbl("ingest", path, "--subject", "P001", "--imu", shank).code == 0
+    for command in (("ingest", path, "--subject", "P001", "--imu", thigh), ("move", 1, "--to", "P001/v2", "--yes")):
+        with faults(fit, "stored_file", away()):
+            assert pbl(*command).error_code == "STORE_UNAVAILABLE"
+
+
 def test_names_that_are_not_utf8_have_a_code(tmp_path: Path):
     path, odd = chain.small_video(tmp_path, "a"), os.fsdecode(b"odd\xff")
     depth = chain.depth_pictures(tmp_path / "depth")
