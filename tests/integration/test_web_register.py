@@ -4,6 +4,7 @@ import asyncio
 import errno
 import os
 import re
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from datajoint.storage import StorageBackend
 
 from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
+from pbl_pipeline.sensors import SEGMENTS, read_samples
 from pbl_schemas import lab, session, study, video
 from pbl_schemas.operations.archive import remove_unfinished, unfinished
 from pbl_schemas.reading.shown import shown_visit
@@ -572,6 +574,28 @@ def test_logs_of_one_form_are_of_one_recording(tmp_path: Path, archive: Path, fa
     names = {str(name) for name in video.WearableImu().to_arrays("imu_name")}
     assert names == {"right shank.1.csv", "left thigh.1.csv"}
     assert not list(archive.rglob("browser-*"))
+
+
+def test_many_logs_are_not_in_memory_together(tmp_path: Path, archive: Path, monkeypatch: pytest.MonkeyPatch):
+    """Neither those that are refused nor those that are one too many; each has its name in the outcome."""
+    browser, made, most = web.client(name="A. First"), [], 0
+    new(browser)
+
+    def counted(path: Path, *more: Any):
+        nonlocal most
+        samples = read_samples(path, *more)
+        made.extend(weakref.ref(one) for one in samples)
+        most = max(most, sum(one() is not None for one in made))
+        return samples
+
+    monkeypatch.setattr(browser_uploads, "samples_of", counted)
+    names = [*(f"right shank {i}.csv" for i in range(12)), *(f"{i}.csv" for i in range(12))]
+    logs = [Swing(seconds=3.0, phase=i).write(tmp_path / name) for i, name in enumerate(names)]
+    parts = [("worn", (log.name, log.read_bytes())) for log in logs]
+    fields = {"token": web.token(browser), "segment": ""}
+    page = browser.post("/visits/1/upload", data=fields, files=parts).text
+    assert ("one of them twice" in page, [name for name in names if name not in page]) == (True, [])
+    assert most <= len(SEGMENTS) + 2  # with one that was just read
 
 
 def test_a_log_of_any_ending_is_no_note_of_the_archive(tmp_path: Path, archive: Path):

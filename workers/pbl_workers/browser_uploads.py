@@ -15,7 +15,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from pbl_pipeline.errors import CODES, MACHINE, PblError, joined
-from pbl_pipeline.sensors import Given, read_given
+from pbl_pipeline.sensors import SEGMENTS, Given, read_given
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import queue_visit, record
 from pbl_schemas.intake import Registered, Sensors, VisitRecord
@@ -120,7 +120,8 @@ def check(
     """Return the files of a form that may be registered, its logs of wearable sensors, and what is refused of them, or
     could not be checked (`check_opens`, `check_log`, `read_given` of each log, `Sensors.at_visit` of all together).
     segment: of the logs, "" where the names in them tell it; of_visit: its `fit.worn_logs`."""
-    good, given, refused, samples = [], [], [], functools.cache(samples_of)
+    most = len(SEGMENTS) + 1  # of so many logs two are on one segment: not all of a form are in memory
+    good, given, refused, samples = [], [], [], functools.lru_cache(most)(samples_of)
     videos = {PurePosixPath(one.name).stem for one, _ in whole if not (one.is_log or one.worn)}
     for one, copy in whole:
         try:
@@ -133,11 +134,10 @@ def check(
             good.append((one, copy))
         except PblError as error:
             refused.append(Received(one.name, "refused", error=error.with_key(one.name), worn=one.worn))
-    worn = Sensors(imu=given, samples=samples)
     try:
-        return good, worn.read()[0].at_visit(*of_visit), refused
+        return good, Sensors(imu=given[:most], samples=samples).read()[0].at_visit(*of_visit), refused
     except PblError as error:
-        return good, Sensors(), [*refused, _refusal(_names(worn), error, worn=True)]
+        return good, Sensors(), [*refused, _refusal(_names(Sensors(imu=given)), error, worn=True)]
 
 
 def _names(worn: Sensors) -> str:
