@@ -70,10 +70,6 @@ def registered_visit(session_id: int) -> dict[str, Any]:
     """Return the row of Session of a number. Raises `PblError` DB_NOT_FOUND for a number that no visit has."""
     rows = (Session & {"session_id": session_id}).to_dicts()
     if not rows:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no session_id {session_id}",
-            expected="a registered visit",
-            next_step="`pbl list visits` prints the numbers",
-        )
+        next_step = "`pbl list visits` prints the numbers"
+        raise PblError("DB_NOT_FOUND", f"no session_id {session_id}", "a registered visit", next_step)
     return rows[0]

@@ -32,7 +32,7 @@ from pbl_pipeline.words import UNUSABLE
 from pbl_schemas import gait, keypoints, session, tables_version, video
 from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
-from pbl_schemas.intake import phone_recordings
+from pbl_schemas.intake import Sensors, phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
 from pbl_schemas.intake.protocols import ProtocolStep, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
@@ -43,9 +43,9 @@ from pbl_schemas.review import Decision
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
 from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
-from pbl_workers.web import Options, Where, create_app
+from pbl_workers.web import Options, Where, create_app, registration
 from pbl_workers.web.phone import next_words, usual_words, verdict
-from tests import Environment, Faults, Limits, Machine, StandIn, not_none
+from tests import Environment, Faults, Limits, Machine, StandIn, not_none, refused
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
@@ -885,6 +885,22 @@ def test_logs_of_wearable_sensors_are_one_set(visit: int, tmp_path: Path):
     assert [answer.status_code for answer in refused] == [415, 415, 403]
     assert (len(video.Video()), len(Decision())) == (1, 1)
     assert not list((tmp_path / "archive").rglob("browser-*"))
+
+
+def test_a_form_of_logs_is_bounded_and_is_of_a_link_that_lasts(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever length the request states; a link that ended while it came attaches nothing."""
+    browser, sent = phone(visit), [("worn", (f"{i}.csv", b"x" * 60_000)) for i in range(2)]
+    with monkeypatch.context() as patch:
+        patch.setattr(registration, "LARGEST_LOG", 100_000)
+        answer = browser.post("/phone/sensors.json", files=sent, headers={"accept-language": "de"})
+    assert (answer.status_code, code(answer)) == (422, "UPLOAD_REFUSED")
+    assert answer.json()["error"]["found"] == "Protokolle von mehr als 0 MB"
+    assert not list((tmp_path / "archive").rglob("browser-*"))
+    phone_recordings.end_link(visit, 1)
+    to = browser_uploads.Place(visit, "P001", "2026-01-10", "R. Viewer", 1)
+    refused("PHONE_LINK", browser_uploads.register, to, [], Sensors(), "", "")
 
 
 def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):

@@ -18,7 +18,7 @@ from pbl_pipeline.errors import CODES, MACHINE, PblError, joined
 from pbl_pipeline.sensors import SEGMENTS, Given, read_given
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import queue_visit, record
-from pbl_schemas.intake import Registered, Sensors, VisitRecord
+from pbl_schemas.intake import Registered, Sensors, VisitRecord, phone_recordings
 from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
@@ -151,7 +151,7 @@ def register(
     with the visit, all together. One outcome for each video, each log without a video, and all wearable sensors; None,
     with nothing done, while the drop folder is being taken over or a person removed.
 
-    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., STORE_..., FILE_UNWRITABLE.
+    Raises `PblError` DB_NOT_FOUND if the visit is gone, PHONE_LINK if the link is, DB_..., STORE_..., FILE_UNWRITABLE.
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
@@ -161,6 +161,8 @@ def register(
         if not obtained:
             return None
         place(to.session_id)  # a visit that was removed is not made again
+        if to.link is not None:
+            phone_recordings.check_link(to.link)
         visit = VisitRecord(to.subject, to.label, activity=activity or None, pace=pace or None)
         for one, copy in arrived:
             if not one.is_log:

@@ -149,6 +149,11 @@ def phone_of(cookie: str) -> Phone:
     return Phone(int(link["phone_link"]), *where, link["link_expires"], link["link_by"])
 
 
+def check_link(number: int) -> None:
+    """Raise `PblError` PHONE_LINK if a link has ended."""
+    _valid(PhoneLink & {"phone_link": number})
+
+
 def hashed(secret: str) -> str:
     """SHA-256 of a key or cookie, in hexadecimal digits."""
     return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
@@ -287,12 +292,8 @@ def not_yet(number: int, error: PblError) -> None:
 
 
 def upload_refused(found: str, next_step: str = "film again; if it happens again, report it") -> PblError:
-    return PblError(
-        "UPLOAD_REFUSED",
-        found=found,
-        expected=f"a recording of at most {PART_BYTES * MOST_PARTS / 1e6:.0f} MB, as the page of a phone sends it",
-        next_step=next_step,
-    )
+    expected = f"a recording of at most {PART_BYTES * MOST_PARTS / 1e6:.0f} MB, as the page of a phone sends it"
+    return PblError("UPLOAD_REFUSED", found, expected, next_step)
 
 
 def _sent(row: Mapping[str, Any]) -> Sent:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import datetime
 import functools
+import math
 from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup, escape
@@ -12,13 +13,14 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import texts
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
 from pbl_pipeline.words import capital
 from pbl_schemas import lab
 from pbl_schemas.fit import worn_logs
 from pbl_schemas.intake import Sensors
+from pbl_schemas.intake.uploads import LARGEST_LOG
 from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
@@ -148,8 +150,8 @@ async def taken_in(
     request: Request, to: Place, good: list[tuple[Arriving, Copy]], worn: Sensors, stated: Mapping[str, str]
 ) -> list[Received]:
     for _ in range(int(_WAIT_S) if good or worn else 0):
-        said = stated.get("activity", ""), stated.get("pace", "")
-        done = await site.ask(request, browser_uploads.register, to, good, worn, *said)
+        about = stated.get("activity", ""), stated.get("pace", "")
+        done = await site.ask(request, browser_uploads.register, to, good, worn, *about)
         if done is not None:
             return done
         await asyncio.sleep(1.0)
@@ -182,7 +184,9 @@ async def _receive(
     text: bytearray | None = None
     file: Arriving | None = None
     kept = bytearray()
-    check = functools.partial(check_token, request) if to.link is None else lambda _: None
+    check, left = functools.partial(check_token, request), math.inf
+    if to.link is not None:
+        check, left = lambda _: None, LARGEST_LOG
 
     async def end() -> None:
         if file is not None:
@@ -191,6 +195,9 @@ async def _receive(
 
     async for found in parts(request):
         if isinstance(found, bytes):
+            if (left := left - len(found)) < 0:
+                much = said("logs of more than {n:.0f} MB", n=LARGEST_LOG / 1e6)
+                raise PblError("UPLOAD_REFUSED", much, "fewer at a time", "leave out what is not of this visit")
             if text is not None:
                 text += found
                 if len(text) > BODY_BYTES:
