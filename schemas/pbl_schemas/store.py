@@ -208,10 +208,5 @@ def store_error(error: BaseException) -> PblError:
 
 
 def _folder_error(folder: Path, found: str) -> PblError:
-    return PblError(
-        "DB_REFUSED",
-        key=folder,
-        found=f"the folder for arrays cannot be used: {found}",
-        expected="a folder you may write to",
-        next_step="set PBL_STORE (or PBL_HOME) to a folder of your own",
-    )
+    about = f"the folder for arrays cannot be used: {found}", "a folder you may write to"
+    return PblError("DB_REFUSED", *about, "set PBL_STORE (or PBL_HOME) to a folder of your own", key=folder)

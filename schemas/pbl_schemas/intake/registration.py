@@ -203,14 +203,11 @@ def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
         row = known.get(file.sha256)
         if row is not None and row["subject"] != visit.subject:
             owner = f"subject {row['subject']}, session {row['session_label']}"
-            raise PblError(
-                "VIDEO_DUPLICATE",
-                found=f"video_id {row['video_id']} of {owner}, has these bytes",
-                expected=f"a recording of subject {visit.subject} (session {visit.session_label}) and of no one else",
-                next_step=f"find out whose recording it is; if not {row['subject']}'s: "
-                f"pbl move {row['video_id']} --to {visit.subject}/{visit.session_label}",
-                key=file.path,
-            )
+            found = f"video_id {row['video_id']} of {owner}, has these bytes"
+            expected = f"a recording of subject {visit.subject} (session {visit.session_label}) and of no one else"
+            move = f"pbl move {row['video_id']} --to {visit.subject}/{visit.session_label}"
+            next_step = f"find out whose recording it is; if not {row['subject']}'s: {move}"
+            raise PblError("VIDEO_DUPLICATE", found, expected, next_step, key=file.path)
 
 
 def insert_new(

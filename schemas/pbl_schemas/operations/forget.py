@@ -181,13 +181,9 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     try:
         with worker.installation_lock(archive.LOCK, connection.connect()) as obtained:
             if not obtained:
-                raise PblError(
-                    "DB_REFUSED",
-                    key=subject,
-                    found="`pbl cron import` is running",
-                    expected="no import, so that no recording appears after it was deleted",
-                    next_step="repeat this when it has ended",
-                )
+                expected = "no import, so that no recording appears after it was deleted"
+                next_step = "repeat this when it has ended"
+                raise PblError("DB_REFUSED", "`pbl cron import` is running", expected, next_step, key=subject)
             return _forget(subject, videos, say)
     except RightMissing as error:  # the account that may also remove the files of the store
         raise RightMissing(error.found, "owner") from error

@@ -184,9 +184,8 @@ async def _receive(
     text: bytearray | None = None
     file: Arriving | None = None
     kept = bytearray()
-    check, left = functools.partial(check_token, request), math.inf
-    if to.link is not None:
-        check, left = lambda _: None, LARGEST_LOG
+    check = functools.partial(check_token, request) if to.link is None else lambda _: None
+    left = math.inf if to.link is None else LARGEST_LOG  # bytes that may still come
 
     async def end() -> None:
         if file is not None:
