@@ -472,9 +472,17 @@ def test_sensors_on_takes_their_log_after_filming(camera: Any, visit: int, tmp_p
         thigh = Swing(phase=1).write(tmp_path / "left thigh.csv")
         gone = shutil.copy(shank, tmp_path / "gone.csv")
         page.evaluate(GONE)
+        held: list[Any] = []
+        page.route("**/phone/sensors.json", lambda route: held.append(route))
         log.set_input_files([none, thigh, gone])
-        for named in ("none.csv", "\u2713", "gone.csv This device cannot read"):
-            page.locator(".worn li", has_text=named).first.wait_for()
+        page.locator(".worn li", has_text="none.csv, left thigh.csv").wait_for()
+        assert log.is_disabled()  # while a set is on its way
+        while not held:
+            page.wait_for_timeout(50)
+        held[0].continue_()
+        for named in ("left thigh.csv \u2713", "gone.csv This device cannot read"):
+            page.locator(".worn li", has_text=named).wait_for()
+        assert log.is_enabled()
     assert not phone_recordings.filming(visit)["log_missing"]
     rows = {row["imu_name"]: row["imu_segments"] for row in video.WearableImu.to_dicts()}
     assert rows == {"shank.csv": {"shank_r": "shank"}, "left thigh.csv": {"thigh_l": "left thigh"}}

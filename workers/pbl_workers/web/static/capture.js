@@ -223,17 +223,19 @@ async function sendAll() {
 // Logs of wearable sensors, which an app or a computer wrote while it was filmed.
 $("[name=worn]").onchange = () => { $(".worn").hidden = !$("[name=worn]").checked; };
 $(".worn input").onchange = async () => {
-  const lines = $(".worn ul"), { failed, gone } = $(".worn").dataset, body = new FormData(), names = [];
+  const input = $(".worn input"), lines = $(".worn ul"), { failed, gone } = $(".worn").dataset, body = new FormData(), names = [];
   body.append("segment", $(".worn select").value);
-  for (const file of $(".worn input").files)
+  for (const file of input.files)
     if (await file.slice(0, 1).arrayBuffer().catch(() => null)) body.append("worn", file), names.push(file.name);
     else lines.prepend(item(file.name, gone));
-  $(".worn input").value = "";
+  input.value = "";
   if (!names.length) return;
+  input.disabled = true;  // of two sets at a time the server takes one
   const line = item(names.join(", "), t("sending", { n: 0 }));
   lines.prepend(line);
   const { outcomes } = await request("/phone/sensors.json", { method: "POST", body }).catch((error) => ({ outcomes: [
-    { name: names.join(", "), said: error instanceof Refusal ? `${error.message}; ${error.expected}` : failed }] }));
+    { name: names.join(", "), said: error instanceof Refusal ? `${error.message}; ${error.expected}` : failed },
+  ] })).finally(() => { input.disabled = false; });
   line.replaceWith(...outcomes.map((/** @type {any} */ one) => item(one.name, `${one.taken ? "\u2713 " : ""}${one.said}`)));
 };
 $("[name=worn]").onchange();
