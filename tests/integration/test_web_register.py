@@ -576,6 +576,19 @@ def test_logs_of_one_form_are_of_one_recording(tmp_path: Path, archive: Path, fa
     assert not list(archive.rglob("browser-*"))
 
 
+def test_logs_alone_leave_the_folders_of_the_archive(tmp_path: Path, archive: Path):
+    """An import, for which they do not wait, may have made one for what it moves there next."""
+    browser = web.client(name="A. First")
+    new(browser)
+    assert upload(browser, small_video(tmp_path, "walk")).status_code == 303
+    made = archive / "P001" / "next"
+    made.mkdir()
+    log = Swing().write(tmp_path / "right shank.csv").read_bytes()
+    fields = {"token": web.token(browser), "segment": ""}
+    page = browser.post("/visits/1/upload", data=fields, files={"worn": ("right shank.csv", log)}).text
+    assert ("right shank.csv: registered" in page, made.is_dir()) == (True, True)
+
+
 def test_many_logs_are_not_in_memory_together(tmp_path: Path, archive: Path, monkeypatch: pytest.MonkeyPatch):
     """Neither those that are refused nor those that are one too many; each has its name in the outcome."""
     browser, made, most = web.client(name="A. First"), [], 0

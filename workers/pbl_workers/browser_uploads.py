@@ -149,13 +149,13 @@ def register(
 ) -> list[Received] | None:
     """Register files that were checked; a sensor log goes with the video of its name, those of wearable sensors
     with the visit, all together. One outcome for each video, each log without a video, and all wearable sensors; None,
-    with nothing done, while the drop folder is being taken over or a person removed.
+    with nothing done, while the drop folder is being taken over or a person removed, unless they come alone.
 
     Raises `PblError` DB_NOT_FOUND if the visit is gone, PHONE_LINK if the link is, DB_..., STORE_..., FILE_UNWRITABLE.
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
-    # Logs of wearable sensors alone need no place in the archive.
+    # Logs of wearable sensors alone need no place in the archive, whose folders may be another's that holds the lock.
     lock = worker.installation_lock(LOCK, video.Video.connection) if arrived else contextlib.nullcontext(True)
     with lock as obtained:
         if not obtained:
@@ -168,12 +168,13 @@ def register(
             if not one.is_log:
                 its_log = logs.pop(PurePosixPath(one.name).stem, None)
                 out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], to.by))
+        if arrived:
+            remove_folders(archive_dir(), to.subject)
     out += [_attach(to, worn)] if worn else []
     alone = functools.partial(
         _refused, "a sensor log alone", "the video of the same name with it", "send both together"
     )
     out += [Received(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
-    remove_folders(archive_dir(), to.subject)
     if any(one.error is None for one in out):
         try:
             queue_visit(to.session_id)
