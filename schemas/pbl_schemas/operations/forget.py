@@ -192,11 +192,9 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
 def _forget(subject: str, videos: bool, say: Say) -> Forgotten:
     ids, found = find(subject)
     if found.running:
-        running = f"{len(found.running)} computations are running: {'; '.join(found.running[:5])}"
+        busy = f"{len(found.running)} computations are running: {'; '.join(found.running[:5])}"
         next_step = "wait for their end, or stop those workers (pbl cron release frees dead ones); then repeat"
-        raise PblError(
-            "DB_REFUSED", running, "none, so that no result appears after it was deleted", next_step, subject
-        )
+        raise PblError("DB_REFUSED", busy, "none, so that no result appears after it was deleted", next_step, subject)
     manifest = {**read_manifest(subject), "subject": subject, "ids": ids, "state": "begun"}
     manifest["files"] = sorted({*manifest.get("files", []), *found.files})
     manifest["videos"] = found.videos
