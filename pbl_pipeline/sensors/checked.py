@@ -272,7 +272,7 @@ def _unclipped(
     for x in values.T:
         for end in (np.nanmax(x), np.nanmin(x)):
             at = np.abs(x - end) <= 1e-4 * abs(end)
-            if abs(end) >= from_:
+            if abs(end) >= from_ and len(at) >= 3:
                 run = at[:-2] & at[1:-1] & at[2:]
                 clipped |= np.convolve(run, [1, 1, 1]) > 0
     share = float(clipped.mean())
