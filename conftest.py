@@ -26,6 +26,7 @@ from typing import Any
 
 import pytest
 
+from pbl_pipeline.resources import fewer_collections
 from tests import SHARED, Calls, Environment, Faults, Limits, Machine, StandIn, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
@@ -58,6 +59,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.enable()
+    fewer_collections()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -65,8 +65,8 @@ def return_free_memory() -> None:
 
 #: Variable with the number of cores of each of several processes that share a machine; `pbl worker` sets it.
 CORES = "PBL_CORES"
-#: Variables by which numerical libraries choose their number of threads when loaded: OpenMP, BLAS, XLA, OpenCV.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
+#: Variables by which numerical libraries choose their number of threads when loaded: OpenMP, XLA, OpenCV.
+_THREADS = ("OMP_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
 #: Makes the GNU C library ask the kernel for large pages: of the 1.4 ms to keep a decoded picture, page faults of 4 KB
 #: took 1.1 ms (research/reports).
 _LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}

@@ -3,10 +3,12 @@ have added."""
 
 import os
 import shutil
-from collections.abc import Iterable
-from contextlib import closing
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -31,6 +33,20 @@ def register(*paths: Path, **visit) -> list[int]:
     results = ingest(paths, VisitRecord(subject=visit.pop("subject", "P001"), **visit))
     assert outcomes(results) == ["registered"] * len(paths), results
     return [r.video_id or 0 for r in results]
+
+
+@contextmanager
+def one_query_at_a_time() -> Iterator[None]:
+    """The test's thread and one of the program share DataJoint's connection, as no two threads do outside tests."""
+    connected, waiting = connection.dj.conn(), threading.RLock()
+    execute = connected._execute_query
+
+    def alone(*args: Any) -> None:
+        with waiting:
+            execute(*args)
+
+    with mock.patch.object(connected, "_execute_query", alone):
+        yield
 
 
 def new_visit(label: str, subject: str = "P001") -> int:

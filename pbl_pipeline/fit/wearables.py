@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
-from pbl_pipeline.errors import PblError, as_said, said
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results import SensorFit
-from pbl_pipeline.sensors.orientation import Orientation, input_error, rate_of
+from pbl_pipeline.sensors.orientation import Orientation, input_error, log_error, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, verticals, wahba
 
@@ -91,7 +91,7 @@ def with_wearables(
     sensors, body = session.worn.sensors, session.body
     seen = [_moved(body, session, i, start) for i in range(len(session.arrays))]
     clocks = _clocks(session, seen)
-    mounts = [_mount(seen, clocks, sensor) for sensor in sensors]
+    mounts = [_mount(session.names, seen, clocks, sensor) for sensor in sensors]
     m, frames, n = len(sensors), len(p.weight), len(p.has_phone)
     longest = max(a.time_s[-1] - a.time_s[0] for a in session.arrays)
     needed = int(np.ceil((longest + 2 * CLOCK_RANGE_S) / SAMPLE_S)) + 2
@@ -199,27 +199,22 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
         ) from error
 
 
-def _mount(seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation) -> np.ndarray:
+def _mount(names: Sequence[str], seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation) -> np.ndarray:
     """The rotation (3, 3) from a sensor to its segment: the stated one, or as they move. Raises `PblError` FIT_INPUT
-    for a stated one that contradicts gravity."""
+    for a stated one that contradicts gravity in a trial."""
     segment = sensor.log.segment
-    reached = [(s, c) for s, c in zip(seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()]
+    reached = [(n, s, c) for n, s, c in zip(names, seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()]
     if sensor.log.mounting is None:
-        return wahba([pair for s, c in reached for pair in vectors(s, c, sensor, segment)])
+        return wahba([pair for _, s, c in reached for pair in vectors(s, c, sensor, segment)])
     mount = Rotation.from_quat(sensor.log.mounting, scalar_first=True)
-    for s, clock in reached:
+    for trial, s, clock in reached:
         ours, theirs = (v.mean(axis=0) for v in verticals(s, clock, sensor, segment))
         theirs = mount.apply(theirs)
         off = np.degrees(np.arccos(ours @ theirs / np.linalg.norm(ours) / np.linalg.norm(theirs)))
         if off > MOUNT_OFF_DEG:
-            about = said("a stated mounting that is {off:.0f} deg off gravity", off=off)
-            raise input_error(
-                said(
-                    "sensor {name} on {segment}: {found}", name=sensor.log.name, segment=as_said(segment), found=about
-                ),
-                "a mounting from the sensor's axes to the segment's (docs/imu.md)",
-                "correct it, or leave it out",
-            )
+            about = said("a stated mounting that is {off:.0f} deg off gravity in trial {trial}", off=off, trial=trial)
+            expected = "a mounting from the sensor's axes to the segment's (docs/imu.md)"
+            raise log_error(sensor.log, about, expected, "correct it, or leave it out")
     return mount.as_matrix()
 
 

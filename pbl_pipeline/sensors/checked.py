@@ -58,10 +58,8 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     notes: list[str] = []
 
     def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
-        about = said(
-            "sensor {name} on {segment}: {found}", name=samples.name, segment=as_said(segment), found=as_said(found)
-        )
-        more = {"next_step": next_step} if next_step else {}
+        on, more = as_said(segment), {"next_step": next_step} if next_step else {}
+        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=on, found=as_said(found))
         raise log_error(about, expected, key=path, **more)
 
     kept = _kept(samples, notes, refuse)
@@ -110,28 +108,23 @@ def _kept(samples: Samples, notes: list[str], refuse: Refuse) -> np.ndarray:
     if back:
         refuse(said("{n} of {all} stamps go back", n=back, all=len(rows)), "times that increase")
     if same > _MOST_REPEATS * len(rows):
-        refuse(
-            said("{n} of {all} stamps repeat the one before", n=same, all=len(rows)),
-            "a different stamp for each sample",
-        )
+        repeated = said("{n} of {all} stamps repeat the one before", n=same, all=len(rows))
+        refuse(repeated, "a different stamp for each sample")
     if same or len(rows) < len(samples.stamp):
         notes.append(f"{same} repeated rows and {len(samples.stamp) - len(rows)} without a time were left out")
     rows = rows[np.concatenate([[True], step > 0])] if len(rows) else rows
     time = samples.stamp[rows]
     hz = 1 / interval_of(time) if len(time) > 1 else 0.0
     if not _HZ[0] <= hz <= _HZ[1] or bounded.span_s(time) > bounded.MAX_SECONDS:
-        refuse(
-            said("{n} samples, {hz:.3g} a second", n=len(time), hz=hz),
-            f"times in s, {_HZ[0]:g} to {_HZ[1]:g} samples a second, at most {bounded.MAX_SECONDS:g} s",
-        )
+        most = f"at most {bounded.MAX_SECONDS:g} s"
+        expected = f"times in s, {_HZ[0]:g} to {_HZ[1]:g} samples a second, {most}"
+        refuse(said("{n} samples, {hz:.3g} a second", n=len(time), hz=hz), expected)
     if samples.counter is not None and samples.stated_hz and len(time) >= _ENOUGH:
         counter = samples.counter[rows]
         off = (time[-1] - time[0]) * samples.stated_hz / max(counter[-1] - counter[0], 1) - 1
         if abs(off) > _OTHER_RATE:
-            refuse(
-                said("{n:g} samples in {s:.4g} s", n=counter[-1] - counter[0], s=time[-1] - time[0]),
-                f"{samples.stated_hz:g} a second, as the file states",
-            )
+            found = said("{n:g} samples in {s:.4g} s", n=counter[-1] - counter[0], s=time[-1] - time[0])
+            refuse(found, f"{samples.stated_hz:g} a second, as the file states")
         if abs(off) > _DRIFT:
             notes.append(f"the stamps run {1e6 * off:+.0f} ppm against the stated {samples.stated_hz:g} Hz")
     return rows
@@ -153,11 +146,9 @@ def _check_gravity(acceleration: np.ndarray, refuse: Refuse) -> None:
     units = (words for words, g in ((", as in g", 1.0), (", as in mg", 1000.0)) if 0.75 * g <= typical <= 1.3 * g)
     in_g = next(units, None) if least > 0.5 * typical else None  # without gravity it comes to nearly 0
     cause = in_g or (", as without gravity" if typical < _GRAVITY[0] else "")
-    refuse(
-        said("accelerations of typically {a:.3g}{cause}", a=typical, cause=said(cause)),
-        "m/s2 with gravity, 9.81 at rest",
-        "multiply by 9.80665 and divide by 1000 where it is mg" if in_g else "export the acceleration with gravity",
-    )
+    found = said("accelerations of typically {a:.3g}{cause}", a=typical, cause=said(cause))
+    scale = "multiply by 9.80665 and divide by 1000 where it is mg"
+    refuse(found, "m/s2 with gravity, 9.81 at rest", scale if in_g else "export the acceleration with gravity")
 
 
 def _slope(of: np.ndarray, on: np.ndarray) -> float:
@@ -191,22 +182,15 @@ def _check_rate(
     elif acceleration is not None:
         factor = _by_gravity(time, rate, acceleration, refuse)
     if fastest > _FASTEST or factor > 20:
-        refuse(
-            said("angular rates of up to {w:.3g}, as in deg/s", w=fastest),
-            f"rad/s, in which a person reaches less than {_FASTEST:g}",
-            "multiply by pi / 180",
-        )
+        found = said("angular rates of up to {w:.3g}, as in deg/s", w=fastest)
+        refuse(found, f"rad/s, in which a person reaches less than {_FASTEST:g}", "multiply by pi / 180")
     if 0 < factor < 0.05:
-        refuse(
-            said("angular rates of up to {w:.3g} rad/s, 1/57 of what its other values turn by", w=fastest),
-            "rates in the unit that the format states",
-            "set the unit of the program's export back to deg/s",
-        )
+        found = said("angular rates of up to {w:.3g} rad/s, 1/57 of what its other values turn by", w=fastest)
+        back = "set the unit of the program's export back to deg/s"
+        refuse(found, "rates in the unit that the format states", back)
     if not (np.isnan(factor) or 0.8 <= factor <= 1.25):
-        refuse(
-            said("rates that are {f:.2f} times those of its orientation", f=factor),
-            "an orientation from the sensor's axes to a world, which turns as the rates say",
-        )
+        found = said("rates that are {f:.2f} times those of its orientation", f=factor)
+        refuse(found, "an orientation from the sensor's axes to a world, which turns as the rates say")
 
 
 def _by_gravity(time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, refuse: Refuse) -> float:
@@ -236,11 +220,9 @@ def _by_gravity(time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, re
     if off[1.0] > np.radians(3) and off[best] < 0.4 * off[1.0]:
         return best
     if against > _AGAINST_DEG:
-        refuse(
-            said("angular rates that turn gravity by {off:.0f} deg in a quarter of a second", off=against),
-            "rates and accelerations of one sensor, in the same axes: gravity keeps its direction",
-            "check the axes and signs of the gyroscope, and that it was on",
-        )
+        found = said("angular rates that turn gravity by {off:.0f} deg in a quarter of a second", off=against)
+        expected = "rates and accelerations of one sensor, in the same axes: gravity keeps its direction"
+        refuse(found, expected, "check the axes and signs of the gyroscope, and that it was on")
     return np.nan
 
 
@@ -295,13 +277,9 @@ def _unclipped(
                 clipped |= np.convolve(run, [1, 1, 1]) > 0
     share = float(clipped.mean())
     if share > _MOST_CLIPPED:
-        refuse(
-            said(
-                "an {what} at the end of the sensor's range in {share:.0%} of the samples", what=said(what), share=share
-            ),
-            f"at most {_MOST_CLIPPED:.0%}",
-            "record with a larger range",
-        )
+        of = said(what)
+        found = said("an {what} at the end of the sensor's range in {share:.0%} of the samples", what=of, share=share)
+        refuse(found, f"at most {_MOST_CLIPPED:.0%}", "record with a larger range")
     if clipped.any():
         notes.append(f"{what}: {int(clipped.sum())} samples at the end of the sensor's range were left out")
     return np.where(clipped[:, None], np.nan, values)
@@ -322,13 +300,13 @@ def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> 
     wrong = {name: off for name, off in days.items() if off[0] > 1}
     for name, (off, sensor) in wrong.items():
         if len(wrong) == len(days):
-            raise log_error(
-                said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=sensor, days=off),
-                "the log of the same visit",
-                next_step="name the log of this visit, or correct the clock of the recording",
-                key=name,
-            )
-    return [f"{name} states a day {off:.1f} days from the log of the sensors" for name, (off, _) in wrong.items()]
+            found = said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=sensor, days=off)
+            next_step = "name the log of this visit, or correct the clock of the recording"
+            raise log_error(found, "the log of the same visit", next_step=next_step, key=name)
+    return [
+        said("{name} states a day {off:.1f} days from the log of the sensors", name=name, off=off)
+        for name, (off, _) in wrong.items()
+    ]
 
 
 def places(

@@ -7,7 +7,7 @@ import dataclasses
 import io
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import PblError, said, unread_file
+from pbl_pipeline.errors import PblError, as_said, said, unread_file
 
 from .checked import checked
 from .formats.read import read_samples
@@ -37,6 +37,9 @@ _DIRECTIONS = {
 }
 #: Sensors of one recording whose logs overlap by less than this share are not of one recording.
 _OVERLAP = 0.5
+_TOGETHER = "name all logs of one recording together; `pbl ingest FILE --imu none` takes older ones away"
+#: Reads the sensors in a file: `read_samples`, or what remembers them (`functools.cache`).
+Read = Callable[[Path, float | None, str | None], Sequence[Samples]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,12 +104,8 @@ def given_sensors(text: str, folder: Path = Path()) -> list[Given]:
 
 def _known(segment: str) -> str:
     if segment not in SEGMENTS:
-        raise PblError(
-            "USAGE",
-            found=said("a sensor on {segment}", segment=segment),
-            expected=", ".join(SEGMENTS),
-            next_step="name one of these segments",
-        )
+        unknown = said("a sensor on {segment}", segment=segment)
+        raise PblError("USAGE", unknown, ", ".join(SEGMENTS), "name one of these segments")
     return segment
 
 
@@ -165,40 +164,27 @@ def _opensense(path: Path) -> list[Given]:
     return out
 
 
-def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
+def read_given(given: Sequence[Given], read: Read = read_samples) -> tuple[SensorLog, ...]:
     """Read sensors of a visit and bring them to one clock, whose time 0 is the start of the first of them.
 
     Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples` and `checked`, and for logs that are not of one
     recording; USAGE: a segment or a sensor is named twice, or the one of a file is not known.
     """
-    found = sensors_in(given)
-    values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
-    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
-    for i, (segment, samples, _) in enumerate(found):
-        if segment in (s for s, _, _ in found[:i]) or (measured[i] and measured[i] in measured[:i]):
-            raise PblError(
-                "USAGE",
-                found=said("the sensor {name} on {segment}: one of them twice", name=samples.name, segment=segment),
-                expected="one sensor on each segment",
-                next_step="name each sensor once",
-            )
-    clocks = {x.clock for _, x, _ in found}
+    found = once(sensors_in(given, read))
+    clocks = {x.clock: w.shown.name for _, x, w in found}
     if len(clocks) > 1:
-        raise log_error(
-            said("sensors on different clocks: {clocks}", clocks=", ".join(sorted(clocks))),
-            "sensors that were synchronised in one recording",
-            key=found[0][2].shown,
-        )
+        named = ", ".join(f"{clock} ({file})" for clock, file in sorted(clocks.items()))
+        apart = said("sensors on different clocks: {clocks}", clocks=named)
+        expected = "sensors that were synchronised in one recording"
+        raise log_error(apart, expected, next_step=_TOGETHER, key=found[0][2].shown)
     found = [(segment, _mounted(_unwrapped(x, found[0][1]), g), g) for segment, x, g in found]
     begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
     logs = tuple(checked(x, segment, w.shown, begin) for segment, x, w in found)
-    first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
-    if logs and last - first < _OVERLAP * min(x.time[-1] - x.time[0] for x in logs):
-        raise log_error(
-            said("logs that have {s:.3g} s in common", s=max(last - first, 0.0)),
-            "sensors of one recording",
-            key=found[0][2].shown,
-        )
+    spans = [(x.time[-1], x.time[0], w.shown.name) for x, (_, _, w) in zip(logs, found, strict=True)]
+    first, last = (min(spans), max(spans, key=lambda span: span[1])) if spans else ((0.0, 0.0, ""),) * 2
+    if (s := first[0] - last[1]) < _OVERLAP * min((end - start for end, start, _ in spans), default=0.0):
+        common = said("logs {a} and {b}, which have {s:.3g} s in common", a=first[2], b=last[2], s=max(s, 0.0))
+        raise log_error(common, "sensors of one recording", next_step=_TOGETHER, key=found[0][2].shown)
     return logs
 
 
@@ -216,23 +202,41 @@ def _unwrapped(samples: Samples, first: Samples) -> Samples:
     return dataclasses.replace(samples, stamp=samples.stamp + more, start_utc=utc)
 
 
-def sensors_in(given: Sequence[Given]) -> list[tuple[str, Samples, Given]]:
+def sensors_in(given: Sequence[Given], read: Read = read_samples) -> list[tuple[str, Samples, Given]]:
     """Read the files: segments, the sensors on them, and by what each was given. A file is read once.
 
     Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples`; USAGE: the sensor or segment of a file is not known.
     """
     wanted = {(g.file, g.rate_hz, g.called) for g in given}
-    files = {one: read_samples(*one) for one in sorted(wanted, key=str)}
+    files = {one: read(*one) for one in sorted(wanted, key=str)}
     return [(*pair, g) for g in given for pair in _chosen(g, files[g.file, g.rate_hz, g.called])]
 
 
-def named(one: Given) -> list[Given]:
+def once(found: list[tuple[str, Samples, Given]]) -> list[tuple[str, Samples, Given]]:
+    """Return what `sensors_in` found. Raises `PblError` USAGE if a segment or a sensor is in it twice."""
+    values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
+    measured = [b"".join(v.tobytes() for v in each if v is not None).strip(b"\0") for each in values]
+    for i, (segment, samples, one) in enumerate(found):
+        before = zip(found[:i], measured, strict=False)
+        if same := [w for (s, _, w), m in before if s == segment or (m and m == measured[i])]:
+            twice = said(
+                "the sensor {name} on {segment}: one of them twice ({file}, {other})",
+                name=samples.name,
+                segment=as_said(segment),
+                file=one.shown.name,
+                other=same[0].shown.name,
+            )
+            raise PblError("USAGE", twice, "one sensor on each segment", "name each sensor once")
+    return found
+
+
+def named(one: Given, read: Read = read_samples) -> list[Given]:
     """A file without a segment as its sensors whose names say one; itself where none does or its format is
     not known. Raises `PblError` SENSOR_LOG as `read_samples`."""
     if one.segment is not None:
         return [one]
     try:
-        return [dataclasses.replace(one, segment=segment, sensor=x.name) for segment, x, _ in sensors_in([one])]
+        return [dataclasses.replace(one, segment=segment, sensor=x.name) for segment, x, _ in sensors_in([one], read)]
     except PblError as error:
         if error.code == "SENSOR_LOG":
             raise
@@ -250,12 +254,13 @@ def _chosen(given: Given, samples: Sequence[Samples]) -> list[tuple[str, Samples
         ours = [x for s, x in by_name if s == given.segment] if len(samples) > 1 else samples
         pairs = [(given.segment, x) for x in ours]
     if not pairs or (given.segment is not None and len(pairs) > 1):
-        names = ", ".join(x.name for x in samples)
+        names, on = ", ".join(x.name for x in samples)[:200], as_said(given.segment or "which segment")
+        file = given.shown.name
         raise PblError(
             "USAGE",
-            found=said("sensors {names} in {file}", names=names[:200], file=given.shown.name),
-            expected=said("which of them is on {segment}", segment=given.segment or "which segment"),
-            next_step="name it: --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE where the file has one sensor",
+            said("which sensor of {file} is on {segment} is not known: {names}", file=file, segment=on, names=names),
+            expected="a sensor for each segment",
+            next_step="state where it was worn; --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE of a single sensor",
             key=given.shown,
         )
     return pairs

@@ -71,7 +71,7 @@ def oriented(log: SensorLog) -> Orientation:
     """
     inertial = log.rate is not None and log.acceleration is not None
     if not inertial and log.orientation is None:
-        raise _log_error(log, "neither rate and acceleration nor orientation", "one of these")
+        raise log_error(log, "neither rate and acceleration nor orientation", "one of these")
     columns: Any = [log.rate, log.acceleration] if inertial else [log.orientation]
     values = np.hstack(columns)
     known = np.isfinite(values).all(axis=1)
@@ -83,7 +83,7 @@ def oriented(log: SensorLog) -> Orientation:
         if len(t) >= FEWEST
     ]
     if not runs:
-        raise _log_error(log, said("{n} usable samples", n=len(time)), said("runs of at least {n}", n=FEWEST))
+        raise log_error(log, said("{n} usable samples", n=len(time)), said("runs of at least {n}", n=FEWEST))
     return Orientation(log, tuple(runs))
 
 
@@ -127,8 +127,8 @@ def input_error(found: str, expected: str, next_step: str = "check the logs of t
     return PblError("FIT_INPUT", found=found, expected=expected, next_step=next_step)
 
 
-def _log_error(log: SensorLog, found: str, expected: str) -> PblError:
-    about = said(
-        "sensor {name} on {segment}: {found}", name=log.name, segment=as_said(log.segment), found=as_said(found)
-    )
-    return input_error(about, expected).about(log.name)
+def log_error(log: SensorLog, found: str, expected: str, *next_step: str) -> PblError:
+    """Return the error FIT_INPUT about a log."""
+    on = as_said(log.segment)
+    about = said("sensor {name} on {segment}: {found}", name=log.name, segment=on, found=as_said(found))
+    return input_error(about, expected, *next_step).about(log.name)

@@ -55,7 +55,7 @@ from .stored_files import file_ref, read_stored, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib
-    from pbl_pipeline.sensors import SensorLog
+    from pbl_pipeline.sensors import Read, SensorLog
 
 
 @schema
@@ -125,7 +125,8 @@ class SessionFit(dj.Computed):
             table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
         worn = None
         if now[0]:
-            worn = _worn(int(one(FitSet & key, "session_id")), {int(t[0]): t[1] for t in trials})
+            of_visit = {"session_id": int(one(FitSet & key, "session_id"))}
+            worn = worn_logs(of_visit, {int(t[0]): t[1] for t in trials})
         return trials, table, height_m, worn, now, method_row(FitMethod, key)
 
     @computes
@@ -202,7 +203,7 @@ class SessionFit(dj.Computed):
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
             if worn is not None:
-                logs, recorded = _read_worn(*worn)[0], [worn[1].get(name) for name in names]
+                logs, recorded = read_worn(*worn)[0], [worn[1].get(name) for name in names]
                 more = {"sensors": logs, "sensor_clock_s": places(logs, recorded, loaded)}
             if any(files):
                 given = [f and DepthFile(stack.enter_context(stored_file(f[0])), *f[1:]) for f in files]
@@ -290,41 +291,39 @@ def _depths(rows: Sequence[tuple]) -> dict[int, tuple]:
     return {r["video_id"]: (file_ref(r["depth_file"]), number(r["depth_scale"]), r["depth_name"]) for r in found}
 
 
-def _worn(session_id: int, names: Mapping[int, str]) -> tuple[list[tuple], dict[str, str | None]]:
-    """Logs of wearable sensors of a visit, (file, its name, segments, rate, mounts) of each, and the time of recording
-    of some of its videos by their names."""
-    of_visit = video.Video & {"session_id": session_id}
-    rows = (video.WearableImu & of_visit.proj()).to_dicts(order_by=("video_id", "imu"))
-    worn = [r for r in rows if r["imu_segments"]]
-    files = [
-        (file_ref(r["imu_file"]), r["imu_name"], dict(r["imu_segments"]), number(r["imu_rate"]), r["imu_mounts"] or {})
-        for r in worn
-    ]
+def worn_logs(of: Any, names: Mapping[int, str] | None = None) -> tuple[list[dict[str, Any]], dict[str, str | None]]:
+    """Logs of wearable sensors of a restriction of Video, rows of WearableImu with the `file_ref` of each, and the time
+    of recording of its videos by `names` (None: of those that are usable, by their numbers)."""
+    videos = video.Video & of
+    if names is None:
+        names = {int(v): f"video_id {v}" for v in (videos - video.NotUsable).to_arrays("video_id")}
+    rows = (video.WearableImu & videos.proj()).to_dicts(order_by=("video_id", "imu"))
     recorded = (video.VideoInfo & inside("video_id", names)).proj("recorded_utc").to_dicts()
-    return files, {names[int(r["video_id"])]: r["recorded_utc"] for r in recorded}
+    logs = [{**row, "imu_file": file_ref(row["imu_file"]), "imu_rate": number(row["imu_rate"])} for row in rows]
+    return logs, {names[int(r["video_id"])]: r["recorded_utc"] for r in recorded}
 
 
-def _read_worn(files: Sequence[tuple], recorded: Mapping[str, str | None]) -> tuple[tuple[SensorLog, ...], list[str]]:
-    """Read the logs of `_worn`; returns them, and notes on the videos' days. Raises `PblError` SENSOR_LOG, USAGE."""
-    from pbl_pipeline.sensors import Given, check_day, read_given
+def read_worn(
+    logs: Sequence[Mapping[str, Any]], recorded: Mapping[str, str | None], read: Read | None = None
+) -> tuple[tuple[SensorLog, ...], list[str]]:
+    """Read logs as `worn_logs` returns them, or of which `imu_file` is the path of a new one, without the tables;
+    returns them, and notes on videos of another day. Raises `PblError` SENSOR_LOG, USAGE: a fit with them would fail.
+    """
+    from pbl_pipeline.sensors import Given, check_day, read_given, read_samples
 
     with ExitStack() as stack:
-        paths = [stack.enter_context(stored_file(ref)) for ref, *_ in files]
-        sensors = read_given(
-            [
-                Given(path, segment, sensor or None, rate, called, mounts.get(segment))
-                for path, (_, called, segments, rate, mounts) in zip(paths, files, strict=True)
-                for segment, sensor in sorted(segments.items())
+        given = []
+        for row in (row for row in logs if row["imu_segments"]):
+            path, called = row["imu_file"], None
+            if not isinstance(path, Path):
+                path, called = stack.enter_context(stored_file(path)), row["imu_name"]
+            mounts = row["imu_mounts"] or {}
+            given += [
+                Given(path, segment, sensor or None, row["imu_rate"], called, mounts.get(segment))
+                for segment, sensor in sorted(row["imu_segments"].items())
             ]
-        )
+        sensors = read_given(given, read or read_samples)
     return sensors, check_day(sensors, recorded)
-
-
-def check_sensors(session_id: int) -> list[str]:
-    """Read the logs of a visit's wearable sensors as its fit does; returns notes on videos of another day. Raises
-    `PblError` SENSOR_LOG, USAGE: the fit would fail."""
-    videos = (video.Video & {"session_id": session_id}) - video.NotUsable
-    return _read_worn(*_worn(session_id, {int(v): f"video_id {v}" for v in videos.to_arrays("video_id")}))[1]
 
 
 def delete_sensor_fits(session_id: int) -> dict[str, int]:

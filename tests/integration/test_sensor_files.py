@@ -4,20 +4,23 @@ import dataclasses
 import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from datajoint.storage import StorageBackend
 
-from pbl_pipeline import settings
+from pbl_pipeline import sensors, settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.records import from_row, plain
 from pbl_pipeline.results import SensorFit
-from pbl_pipeline.sensors import SensorLog
+from pbl_pipeline.sensors import Given, SensorLog, named, read_samples
+from pbl_pipeline.sensors.formats.samples import Samples
 from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
+from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
 from tests import Faults, StandIn, not_none, worn_sensor
@@ -291,6 +294,30 @@ def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
     told = pbl("ingest", path, "--subject", "P001", "--imu", f"foot_r={foot}")
     assert (told.code, told.error_code, "different clocks" in told.err) == (1, "SENSOR_LOG", True)
     assert len(video.WearableImu()) == 1
+
+
+def test_logs_are_read_once_and_outside_of_transactions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """And what comes to the visit meanwhile is not passed over."""
+    path, reads = chain.small_video(tmp_path, "a"), []
+
+    def counted(file: Path, *more: Any) -> list[Samples]:
+        reads.append((file, lab.schema.connection.in_transaction))
+        return read_samples(file, *more)
+
+    monkeypatch.setattr(sensors, "read_samples", counted)
+    shank, thigh, foot = (
+        worn_sensor.apdm({name: Swing(phase=i)}, tmp_path / f"{name}.csv")
+        for i, name in enumerate(("Right Ankle", "Right Thigh", "Left Foot"))
+    )
+    assert pbl("ingest", path, "--subject", "P001", "--imu", shank).code == 0
+    assert reads == [(shank, False)]
+    late = Sensors(imu=named(Given(foot))).read()[0].at_visit(*fit.worn_logs({"session_id": 1}))
+    reads.clear()
+    assert pbl("ingest", path, "--subject", "P001", "--imu", thigh).code == 0
+    assert [(file == thigh, inside) for file, inside in reads] == [(True, False), (False, False)]  # and the stored one
+    with pytest.raises(PblError) as meanwhile:
+        attach_worn(1, late)
+    assert (meanwhile.value.code, len(video.WearableImu())) == ("DECIDED_MEANWHILE", 2)
 
 
 def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: StandIn):

@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -293,15 +293,38 @@ def advice() -> Iterator[str]:
     """Advice of every check in the library and the tables, with a number for what is filled in."""
     for file in files("pbl_pipeline", "pbl_schemas"):
         tree = nodes(file)
-        named: dict[str, list[ast.expr]] = {}
-        for node in tree:
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                named.setdefault(node.targets[0].id, []).append(node.value)
+        named = _named(tree)
         for node in tree:
             made = isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Check", "warn_if")
             if not made or not isinstance(node, ast.Call) or len(node.args) < 5:
                 continue
             yield from _texts_of(node.args[4], named)
+
+
+def _named(tree: Iterable[ast.AST]) -> dict[str, list[ast.expr]]:
+    """Values that the names of a module get."""
+    named: dict[str, list[ast.expr]] = {}
+    for node in tree:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            named.setdefault(node.targets[0].id, []).append(node.value)
+    return named
+
+
+def _parts(node: ast.Call, named: dict[str, list[ast.expr]]) -> dict[str, ast.expr]:
+    """Found, expected and next step of an error, by name or in their places; a name stands for its last value."""
+    names, of = ("found", "expected", "next_step"), getattr(node.func, "id", "")
+    places = node.args[1:] if of == "PblError" else node.args if of in ("refused", "_refused", "conflict") else []
+    out: list[ast.expr] = []
+    for place in places:
+        value = _last(place.value, named) if isinstance(place, ast.Starred) else place
+        out += value.elts if isinstance(place, ast.Starred) and isinstance(value, ast.Tuple) else [value]
+    found = dict(zip(names, out, strict=False)) | {k.arg: k.value for k in node.keywords if k.arg in names}
+    return {name: _last(value, named) for name, value in found.items()}
+
+
+def _last(value: ast.expr, named: dict[str, list[ast.expr]]) -> ast.expr:
+    before = [v for v in named.get(getattr(value, "id", ""), ()) if v.lineno <= value.lineno]
+    return max(before, key=lambda v: v.lineno, default=value)
 
 
 def _texts_of(node: ast.expr, named: dict[str, list[ast.expr]]) -> list[str]:
@@ -345,13 +368,10 @@ def test_every_refusal_of_a_page_has_its_german(file: str):
     tree = nodes(ROOT / file)[0]
     assert isinstance(tree, ast.Module)
     (top,) = [n for n in tree.body if getattr(n, "name", "") == function] if function else [tree]
-    said: list[str] = []
+    named, said = _named(ast.walk(tree)), []
     for node in ast.walk(top):
-        if not isinstance(node, ast.Call):
-            continue
-        parts = [k.value for k in node.keywords if k.arg in ("found", "expected", "next_step")]
-        parts += node.args[:3] if getattr(node.func, "id", "") in ("refused", "_refused", "conflict") else []
-        said += [text for part in parts for text in _texts_of(part, {})]
+        if isinstance(node, ast.Call):
+            said += [text for part in _parts(node, named).values() for text in _texts_of(part, {})]
     assert said
     assert not [text for text in said if "<span" in texts.on_page("de", text)]
 
@@ -359,10 +379,11 @@ def test_every_refusal_of_a_page_has_its_german(file: str):
 def refusals() -> Iterator[tuple[str, str, str]]:
     """Code, found and next step of every error of library and tables, with numbers for what is filled in."""
     for file in files("pbl_pipeline", "pbl_schemas"):
+        named = _named(nodes(file))
         for node in nodes(file):
-            if not isinstance(node, ast.Call) or not any(k.arg == "next_step" for k in node.keywords):
+            if not isinstance(node, ast.Call) or "next_step" not in (parts := _parts(node, named)):
                 continue
-            given = {k.arg: _texts_of(k.value, {}) for k in node.keywords if k.arg in ("found", "next_step")}
+            given = {name: _texts_of(part, {}) for name, part in parts.items()}
             codes = [a.value for a in node.args if isinstance(a, ast.Constant) and a.value in CODES] or ["FIT_INPUT"]
             for found, step in itertools.product(given.get("found") or ["x"], given["next_step"] or ["x"]):
                 yield str(codes[0]), found, step

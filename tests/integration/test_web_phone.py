@@ -39,6 +39,7 @@ from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations.archive import note_placed
 from pbl_schemas.reading import usable as module_usable
 from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
+from pbl_schemas.review import Decision
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
 from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
@@ -49,6 +50,7 @@ from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
 from tests.rows import new_visit, register
+from tests.worn_sensor import Swing
 
 Killed = Callable[[], AbstractContextManager[None]]
 
@@ -843,6 +845,46 @@ def test_a_reader_is_told_of_missing_logs_without_the_way_to_send_them(visit: in
         page = web.client(role=role).get(f"/visits/{visit}").text
         assert "none of their logs" in page
         assert page.count(f"/visits/{visit}/upload") == links
+
+
+def test_logs_of_wearable_sensors_are_one_set(visit: int, tmp_path: Path):
+    """As on the page of a visit: one that is refused is named, the others stay, and a set is a decision."""
+    browser, none = phone(visit), tmp_path / "none.csv"
+    none.write_text("frame,x\n1,2\n")
+    logs = [Swing(phase=i).write(tmp_path / f"{name}.csv") for i, name in enumerate(("right shank", "left thigh"))]
+
+    def sent(*files: Path, segment: str = "", what: str = "worn", **headers: str) -> Any:
+        parts = [(what, (f.name, f.read_bytes())) for f in files] or {"worn": ("", b"")}
+        return browser.post("/phone/sensors.json", data={"segment": segment}, files=parts, headers=headers)
+
+    def told(*files: Path, segment: str = "", language: str = "en") -> dict[str, tuple[bool, str]]:
+        answer = sent(*files, segment=segment, **{"accept-language": language})
+        assert answer.status_code == 200, answer.text
+        return {one["name"]: (one["taken"], one["said"]) for one in answer.json()["outcomes"]}
+
+    both = ", ".join(log.name for log in logs)
+    assert "without a recording" in told(*logs)[both][1]
+    send(browser, film(tmp_path))
+    found = told(none, *logs)
+    assert (found[none.name][0], found[both][0], len(found)) == (False, True, 2)
+    assert "no known format" in found[none.name][1]
+    assert "right shank" in found[both][1]
+    decision = Decision.fetch1()
+    assert (decision["decision_what"], decision["decision_by"]) == ("sensors", "R. Viewer")
+    assert (decision["decision_after"], decision["decision_about"]) == (
+        {"sensors": ["shank_r", "thigh_l"]},
+        {"phone_link": 1},
+    )
+    taken, said = told(*logs, segment="foot_r")[both]
+    assert (taken, "one of them twice" in said, all(log.name in said for log in logs)) == (False, True, True)
+    assert "in keinem bekannten Format" in told(none, language="de")[none.name][1]
+    assert told(language="de") == {"": (False, "Keine Datei. Die Protokolle wählen, alle zusammen.")}
+    assert "registered before" in told(*logs)[both][1]
+    assert {str(name) for name in video.WearableImu.to_arrays("imu_name")} == {log.name for log in logs}
+    refused = [sent(*logs, what="files"), sent(*logs, segment="knee"), sent(*logs, origin="https://evil.example")]
+    assert [answer.status_code for answer in refused] == [415, 415, 403]
+    assert (len(video.Video()), len(Decision())) == (1, 1)
+    assert not list((tmp_path / "archive").rglob("browser-*"))
 
 
 def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):

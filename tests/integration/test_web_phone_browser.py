@@ -50,6 +50,15 @@ CANVAS = """
 """
 
 
+#: In the page: a file that was removed after it was chosen.
+GONE = """
+() => {
+  const slice = Blob.prototype.slice;
+  Blob.prototype.slice = function (...at) {
+    return this.name === "gone.csv" ? {arrayBuffer: () => Promise.reject()} : slice.apply(this, at);
+  };
+}
+"""
 #: In the page: the next three texts of the hint, and when each came (ms).
 CUT_WHEN = """
 () => new Promise((done) => {
@@ -459,9 +468,16 @@ def test_sensors_on_takes_their_log_after_filming(camera: Any, visit: int, tmp_p
         log.set_input_files(shank)
         page.locator(".worn li", has_text="right shank").wait_for()
         missing.wait_for(state="detached")
+        page.get_by_label("Worn on").select_option("")
+        thigh = Swing(phase=1).write(tmp_path / "left thigh.csv")
+        gone = shutil.copy(shank, tmp_path / "gone.csv")
+        page.evaluate(GONE)
+        log.set_input_files([none, thigh, gone])
+        for named in ("none.csv", "\u2713", "gone.csv This device cannot read"):
+            page.locator(".worn li", has_text=named).first.wait_for()
     assert not phone_recordings.filming(visit)["log_missing"]
-    row = video.WearableImu.fetch1()
-    assert (row["imu_name"], row["imu_segments"]) == ("shank.csv", {"shank_r": "shank"})
+    rows = {row["imu_name"]: row["imu_segments"] for row in video.WearableImu.to_dicts()}
+    assert rows == {"shank.csv": {"shank_r": "shank"}, "left thigh.csv": {"thigh_l": "left thigh"}}
     assert about_the_recording()["worn"] == "on"
 
 

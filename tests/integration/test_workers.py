@@ -41,7 +41,7 @@ from pbl_workers.recover import CRASHES
 from pbl_workers.supervisor import BATCH_NICE, Supervisor
 from research.benchmarks import worker_replay
 from tests import Faults, Limits, until
-from tests.rows import register
+from tests.rows import one_query_at_a_time, register
 
 from . import chain, worker_target
 from .jobs import beat, counts, first_job, hold, jobs_left, queued, work
@@ -221,11 +221,12 @@ def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
             boss.stop()
 
     beside = threading.Thread(target=do)
-    beside.start()
-    try:
-        return boss.run()
-    finally:
-        beside.join()
+    with one_query_at_a_time():
+        beside.start()
+        try:
+            return boss.run()
+        finally:
+            beside.join()
 
 
 @pytest.fixture
@@ -467,9 +468,10 @@ def test_a_phone_does_not_wait_for_the_job_in_hand(tables: None, tmp_path: Path,
     register(*videos(tmp_path, "hangs"))
     boss = Supervisor(Options(resource="decode", selftest=False, grace_s=0.0, phones=True), target=worker_target.work)
     seen: dict[str, int] = {}
+    jobs = jobs_of(video.VideoInfo)
 
     def film() -> None:
-        until(lambda: bool(len(video.VideoInfo.jobs.reserved)) and len(live_workers()) == 2, 120)
+        until(lambda: bool(len(jobs.reserved)) and len(live_workers()) == 2, 120)
         (filmed,) = register(*videos(tmp_path, "filmed"), session_label="filmed")
         queue.fill(video.VideoInfo, [{"video_id": filmed}], registry.FIRST)
         until(lambda: len(video.VideoInfo()) == 1, 120)

@@ -7,16 +7,15 @@ import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
-from unittest import mock
 
 import uvicorn
 from starlette.testclient import TestClient
 
-from pbl_schemas.connection import dj
 from pbl_workers.on_request import compute_visit
 from pbl_workers.web import Options, ResultsFolder, Where, create_app
 from pbl_workers.web.serve import config
 from pbl_workers.web.site import Target
+from tests.rows import one_query_at_a_time
 
 BASE = "http://127.0.0.1:8484"
 
@@ -65,20 +64,6 @@ def form_of(browser: TestClient, page: str, action: str) -> dict[str, str]:
     form = form[: form.index("</form>")]
     events = re.findall(r'data-(events)="([^"]*)"', form)
     return dict([*re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form), *events])
-
-
-@contextlib.contextmanager
-def one_query_at_a_time() -> Iterator[None]:
-    """The page's thread and the test's share DataJoint's connection, as no two threads do outside tests."""
-    connection, waiting = dj.conn(), threading.RLock()
-    execute = connection._execute_query
-
-    def alone(*args: Any) -> None:
-        with waiting:
-            execute(*args)
-
-    with mock.patch.object(connection, "_execute_query", alone):
-        yield
 
 
 @contextlib.contextmanager

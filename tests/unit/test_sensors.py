@@ -111,11 +111,11 @@ def test_a_stated_mounting_starts_the_pelvis_and_must_not_contradict_gravity(tru
         stated = Rotation.from_euler(turn, 60, degrees=True) * mounts["pelvis"]
         log = dataclasses.replace(alone, mounting=stated.as_quat(scalar_first=True))
         if refused:
-            with pytest.raises(PblError, match="off gravity") as wrong:
-                _mount([seen], [0.1], oriented(log))
+            with pytest.raises(PblError, match="off gravity in trial walk2") as wrong:
+                _mount(["walk1", "walk2"], [seen, seen], [1e3, 0.1], oriented(log))
             assert wrong.value.code == "FIT_INPUT"
         else:
-            np.testing.assert_allclose(_mount([seen], [0.1], oriented(log)), stated.as_matrix(), atol=1e-9)
+            np.testing.assert_allclose(_mount(["walk"], [seen], [0.1], oriented(log)), stated.as_matrix(), atol=1e-9)
 
 
 def test_orientation_alone_is_enough(truth, seen):

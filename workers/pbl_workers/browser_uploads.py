@@ -3,6 +3,7 @@ upload of the drop folder."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -11,8 +12,10 @@ import os
 import secrets
 from collections.abc import Sequence
 from pathlib import PurePosixPath
+from typing import Any
 
 from pbl_pipeline.errors import CODES, MACHINE, PblError, joined
+from pbl_pipeline.sensors import Given, read_given
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import queue_visit, record
 from pbl_schemas.intake import Registered, Sensors, VisitRecord
@@ -21,7 +24,7 @@ from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 from pbl_schemas.operations.folders import private_folder, remove_empty
 
-from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, read_worn, register_copies, sensors_of
+from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, register_copies, samples_of
 from .log import event
 
 log = logging.getLogger("pbl.web")
@@ -31,11 +34,13 @@ _refused = functools.partial(PblError, "UPLOAD_REFUSED")
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """The visit that files are sent for."""
+    """The visit that files are sent for; by: who sends them; link: of the phone that does, None without one."""
 
     session_id: int
     subject: str
     label: str
+    by: str = ""
+    link: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +56,10 @@ class Received:
     note: str = ""
 
 
-def place(session_id: int) -> Place:
+def place(session_id: int, by: str = "") -> Place:
     """Return the visit. Raises `PblError` DB_NOT_FOUND."""
     visit = session.registered_visit(session_id)
-    return Place(session_id, visit["subject"], visit["session_label"])
+    return Place(session_id, visit["subject"], visit["session_label"], by)
 
 
 class Arriving:
@@ -110,26 +115,29 @@ class Arriving:
 
 
 def check(
-    whole: Sequence[tuple[Arriving, Copy]], segment: str
+    whole: Sequence[tuple[Arriving, Copy]], segment: str, of_visit: tuple[list[dict[str, Any]], dict[str, str | None]]
 ) -> tuple[list[tuple[Arriving, Copy]], Sensors, list[Received]]:
     """Return the files of a form that may be registered, its logs of wearable sensors, and what is refused of them, or
-    could not be checked (`check_opens`, `check_log`, `sensors_of`, `read_worn`)."""
-    good, given, refused = [], [], []
+    could not be checked (`check_opens`, `check_log`, `read_given` of each log, `Sensors.at_visit` of all together).
+    segment: of the logs, "" where the names in them tell it; of_visit: its `fit.worn_logs`."""
+    good, given, refused, samples = [], [], [], functools.cache(samples_of)
     videos = {PurePosixPath(one.name).stem for one, _ in whole if not (one.is_log or one.worn)}
     for one, copy in whole:
         try:
             if one.worn:
-                given += sensors_of(one.path, segment)
+                own = read_given([Given(one.path, segment or None)], samples)
+                given += [Given(one.path, log.segment, log.name) for log in own]
                 continue
             if not one.is_log or PurePosixPath(one.name).stem in videos:  # a log alone is refused as such
                 (check_log if one.is_log else check_opens)(one.path)
             good.append((one, copy))
         except PblError as error:
             refused.append(Received(one.name, "refused", error=error.with_key(one.name), worn=one.worn))
+    worn = Sensors(imu=given, samples=samples)
     try:
-        return good, read_worn(given), refused
+        return good, worn.read()[0].at_visit(*of_visit), refused
     except PblError as error:
-        return good, Sensors(), [*refused, _refusal(_names(Sensors(imu=given)), error, worn=True)]
+        return good, Sensors(), [*refused, _refusal(_names(worn), error, worn=True)]
 
 
 def _names(worn: Sensors) -> str:
@@ -137,7 +145,7 @@ def _names(worn: Sensors) -> str:
 
 
 def register(
-    to: Place, arrived: Sequence[tuple[Arriving, Copy]], worn: Sensors, activity: str, pace: str, by: str
+    to: Place, arrived: Sequence[tuple[Arriving, Copy]], worn: Sensors, activity: str, pace: str
 ) -> list[Received] | None:
     """Register files that were checked; a sensor log goes with the video of its name, those of wearable sensors
     with the visit, all together. One outcome for each video, each log without a video, and all wearable sensors; None,
@@ -147,7 +155,9 @@ def register(
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
-    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
+    # Logs of wearable sensors alone need no place in the archive.
+    lock = worker.installation_lock(LOCK, video.Video.connection) if arrived else contextlib.nullcontext(True)
+    with lock as obtained:
         if not obtained:
             return None
         place(to.session_id)  # a visit that was removed is not made again
@@ -155,13 +165,10 @@ def register(
         for one, copy in arrived:
             if not one.is_log:
                 its_log = logs.pop(PurePosixPath(one.name).stem, None)
-                out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], by))
-    out += [_attach(to, worn, by)] if worn else []
+                out.append(_register_copies(visit, one.name, [copy, its_log] if its_log else [copy], to.by))
+    out += [_attach(to, worn)] if worn else []
     alone = functools.partial(
-        _refused,
-        found="a sensor log alone",
-        expected="the video of the same name with it",
-        next_step="send both together",
+        _refused, "a sensor log alone", "the video of the same name with it", "send both together"
     )
     out += [Received(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
@@ -182,7 +189,7 @@ def _refusal(name: str, error: PblError, worn: bool = False) -> Received:
     return Received(name, "refused", error=error.with_key(name), worn=worn)
 
 
-def _attach(to: Place, worn: Sensors, by: str) -> Received:
+def _attach(to: Place, worn: Sensors) -> Received:
     name = _names(worn)
     try:
         done = attach_worn(to.session_id, worn)
@@ -190,7 +197,8 @@ def _attach(to: Place, worn: Sensors, by: str) -> Received:
         return _refusal(name, error, worn=True)
     if done:
         segments = sorted(one.segment or "" for one in worn.imu)
-        record("sensors", by, {}, {}, {"sensors": segments}, session_id=to.session_id)
+        about = {} if to.link is None else {"phone_link": to.link}
+        record("sensors", to.by, about, {}, {"sensors": segments}, session_id=to.session_id)
     return Received(name, "registered" if done else "known", worn=True, note=joined(done, "; "))
 
 

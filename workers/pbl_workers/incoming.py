@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import hashlib
 import multiprocessing
 import os
@@ -22,7 +23,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pymysql
 
@@ -30,7 +31,7 @@ from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
-from pbl_pipeline.sensors import Given, SensorLog, read_given
+from pbl_pipeline.sensors import read_samples
 from pbl_pipeline.video import read_first, read_phone_log
 from pbl_schemas import video, worker
 from pbl_schemas.connection import dj
@@ -51,6 +52,9 @@ from pbl_schemas.operations.archive import (
 )
 from pbl_schemas.operations.folders import private_folder, remove_empty, sync_folders
 from pbl_schemas.subject_codes import check_subject
+
+if TYPE_CHECKING:
+    from pbl_pipeline.sensors.formats.samples import Samples
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0
@@ -265,12 +269,9 @@ def keep_free(folder: Path, n_bytes: int) -> None:
 def check_room(n_bytes: int, next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
     if not has_room(archive_dir(), n_bytes):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
-            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step=next_step,
-        )
+        found = f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server"
+        expected = f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free"
+        raise PblError("FILE_UNWRITABLE", found, expected, next_step)
 
 
 def check_opens(path: Path) -> None:
@@ -284,35 +285,21 @@ def check_log(path: Path) -> None:
     _within_limits(read_phone_log, path, LOG_S, LOG_BYTES)
 
 
-def sensors_of(file: Path, segment: str) -> list[Given]:
-    """Return the wearable sensors that a log is of. `segment`: "" where their names in it tell them. Raises `PblError`
-    as `read_worn`."""
-    return [Given(file, log.segment, log.name) for log in _read_logs([Given(file, segment or None)])]
-
-
-def read_worn(given: Sequence[Given]) -> Sensors:
-    """Read logs of wearable sensors together (`Sensors.read`), in a process with limits. Raises what that raises;
+def samples_of(path: Path, rate_hz: float | None = None, called: str | None = None) -> list[Samples]:
+    """Read the wearable sensors in a log (`read_samples`), in a process with limits. Raises what that raises;
     MACHINE_SHORT."""
-    return Sensors(imu=given).read(_read_logs)[0]
-
-
-def _read_logs(given: Sequence[Given]) -> tuple[SensorLog, ...]:
-    return _within_limits(read_given, given, LOG_S, LOG_BYTES, returns=True) if given else ()
+    return _within_limits(functools.partial(read_samples, rate_hz=rate_hz, called=called), path, LOG_S, LOG_BYTES, True)
 
 
 def _within_limits(
-    read: Callable[[Any], object], file: Path | Sequence[Given], seconds: float, n_bytes: int, returns: bool = False
+    read: Callable[[Path], object], file: Path, seconds: float, n_bytes: int, returns: bool = False
 ) -> Any:
     try:
         return limited(read, file, seconds=seconds, n_bytes=n_bytes, returns=returns)
     except LimitExceeded as error:
-        raise PblError(
-            "MACHINE_SHORT",
-            found=f"the file was not opened: {error}",
-            expected=f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory",
-            next_step="try again; if it stays so, give the server more memory, or fewer processes",
-            key=file if isinstance(file, Path) else None,
-        ) from error
+        expected = f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory"
+        next_step = "try again; if it stays so, give the server more memory, or fewer processes"
+        raise PblError("MACHINE_SHORT", f"the file was not opened: {error}", expected, next_step, key=file) from error
 
 
 def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
@@ -331,7 +318,7 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
-    (result,) = register([OneCamera(target, visit, sensors)])
+    (result,) = register([OneCamera(target, visit, sensors, recording.sha256)])
     if result.error is not None:
         if has_row(target):
             note.unlink()

@@ -17,13 +17,13 @@ from pathlib import Path
 from pbl_pipeline.errors import PblError
 from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
-from pbl_schemas.intake import Sensors, VisitRecord, phone_recordings
+from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders, unfinished
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_log, check_opens, check_room, keep_free, read_worn, register_copies, sensors_of
+from .incoming import Copy, check_log, check_opens, check_room, keep_free, register_copies
 from .registry import FIRST
 
 
@@ -131,36 +131,19 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     visit = VisitRecord(phone.subject, phone.label, **stated)
     with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            raise PblError(
-                "DB_REFUSED",
-                found="recordings of the drop folder are being taken over",
-                expected="one import at a time",
-                next_step="the page tries again",
-            )
+            found = "recordings of the drop folder are being taken over"
+            raise PblError("DB_REFUSED", found, "one import at a time", "the page tries again")
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
         if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
             # Without the owner: the phone has the right to its own visit alone.
-            raise PblError(
-                "VIDEO_DUPLICATE",
-                found="this recording is registered in another visit",
-                expected="a recording of this visit",
-                next_step="film again; who runs the server can find and move it (`pbl move`)",
-            )
+            found = "this recording is registered in another visit"
+            next_step = "film again; who runs the server can find and move it (`pbl move`)"
+            raise PblError("VIDEO_DUPLICATE", found, "a recording of this visit", next_step)
         result = register_copies(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)
     phone_recordings.received(sent.number, result.video_id)
     return result.video_id
-
-
-def read_log(folder: Path, name: str, segment: str, body: bytes) -> Sensors:
-    """Write the log of a wearable sensor to a folder and read it there. Raises `PblError` as `read_worn`; OSError."""
-    file = folder / plain_name(name)
-    file.write_bytes(body)
-    try:
-        return read_worn(sensors_of(file, segment))
-    except PblError as error:
-        raise error.with_key(file.name) from error
 
 
 def discard(phone: Phone, sent: Sent) -> None:

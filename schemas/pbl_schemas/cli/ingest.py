@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -268,16 +269,17 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[str, ...], imu: tupl
     """Sensor files of each of the n videos; the first has those that the person wore. Raises `PblError` USAGE where
     files and videos do not match, what `given_sensors` raises."""
     from pbl_pipeline.depth import DepthFile
-    from pbl_pipeline.sensors import given_sensors, named
+    from pbl_pipeline.sensors import given_sensors, named, read_samples
     from pbl_schemas.intake import Sensors
     from pbl_schemas.intake.records import usage
     from pbl_schemas.intake.sensors import NONE
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
         check_one_each(what, given, n, "name a file for each video, 'none' for one without")
-    worn = [sensor for text in imu for one in given_sensors(text) for sensor in named(one)]
+    read = functools.cache(read_samples)
+    worn = [sensor for text in imu for one in given_sensors(text) for sensor in named(one, read)]
     if n > 1 and (files := [one.file.name for one in worn if one.segment is None and str(one.file) != NONE]):
         alone = "name the segment, such as --imu shank_r=FILE, or ingest that video in a separate call"
         raise usage(f"--imu {files[0]} for {n} videos", "the segment of a sensor", next_step=alone)
     logs, depths = list(attitude) or [None] * n, [DepthFile.of(text) for text in depth] or [None] * n
-    return [Sensors(a, d, worn if i == 0 else ()) for i, (a, d) in enumerate(zip(logs, depths, strict=True))]
+    return [Sensors(a, d, worn if i == 0 else (), read) for i, (a, d) in enumerate(zip(logs, depths, strict=True))]

@@ -97,12 +97,9 @@ def remove_calibration(camera_id: int) -> list[CalibrationChange]:
     rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
     if not rows:
         there = sorted({int(n) for n in lab.DeviceCalibration.to_arrays("camera_id")})
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no device with calibration {camera_id}",
-            expected=f"one of {', '.join(map(str, there))}" if there else "a device with a calibration",
-            next_step="`pbl camera list` shows the numbers",
-        )
+        found = f"no device with calibration {camera_id}"
+        expected = f"one of {', '.join(map(str, there))}" if there else "a device with a calibration"
+        raise PblError("DB_NOT_FOUND", found, expected, "`pbl camera list` shows the numbers")
     keys = [{k: row[k] for k in lab.DeviceCalibration.primary_key} for row in rows]
     return _retried(in_transaction(lambda: [_replace(key, None) for key in keys]))
 

@@ -24,7 +24,7 @@ from ..subject_codes import check_subject
 from ..transactions import in_transaction
 from ..video import unknown_video
 from .records import VisitRecord, session_ids
-from .sensors import carriers, hand_on
+from .sensors import carriers, hand_on, read_carried
 from .videos import check_same_number
 
 #: Plans of a visit that follow a video into its new one.
@@ -60,12 +60,8 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
         raise unknown_video(video_id)
     (row,) = rows
     if (row["subject"], row["session_label"]) == (subject, session_label):
-        raise PblError(
-            "USAGE",
-            found=f"video_id {video_id} is in {subject}/{session_label} already",
-            expected="another visit",
-            next_step="nothing is to be done",
-        )
+        found = f"video_id {video_id} is in {subject}/{session_label} already"
+        raise PblError("USAGE", found, "another visit", "nothing is to be done")
     numbers = fit.videos_of(fit.trial_of(video_id))
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()
@@ -103,7 +99,8 @@ def carry_out(plan: Move) -> None:
     Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
     cannot be moved, or another process is changing the archive. Nothing is changed then.
     """
-    of_these = [{"video_id": v} for v in plan.files]
+    numbers = list(plan.files)
+    of_these = [{"video_id": v} for v in numbers]
 
     def work(paths: Mapping[int, Path]) -> None:
         again = plan_move(plan.video_id, *plan.after)
@@ -119,11 +116,12 @@ def carry_out(plan: Move) -> None:
                 here = set(points.to_arrays("keypoint_method"))
                 rows = [row for row in rows if row["keypoint_method"] in here]
             table.insert(({**row, "session_id": new} for row in rows), skip_duplicates=True)
-        hand_on(list(plan.files), old, new)
+        hand_on(numbers, old, new, read)
 
+    read = read_carried(numbers, *plan.after) if not plan.left and carriers(numbers) else []
     with _moved_files(plan) as paths:
         in_transaction(lambda: work(paths), fresh=True)
-    for number in plan.files:
+    for number in numbers:
         forget_errors(number)
 
 

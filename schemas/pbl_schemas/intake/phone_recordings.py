@@ -47,13 +47,14 @@ _LONGEST = 980
 
 @dataclasses.dataclass(frozen=True)
 class Phone:
-    """A phone that may film for a visit by its link."""
+    """A phone that may film for a visit by its link. by: who made that."""
 
     link: int
     session_id: int
     subject: str
     label: str
     expires: datetime.datetime
+    by: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,19 +83,11 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
     for an unknown visit or protocol, USAGE for a time that is too long."""
     session.registered_visit(session_id)
     if protocol is not None and not Protocol & {"protocol": protocol}:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no protocol {protocol}",
-            expected="a registered protocol",
-            next_step="`pbl capture protocol NAME SHEET` registers one",
-        )
+        next_step = "`pbl capture protocol NAME SHEET` registers one"
+        raise PblError("DB_NOT_FOUND", f"no protocol {protocol}", "a registered protocol", next_step)
     if not 0 < hours <= MOST_HOURS:
-        raise PblError(
-            "USAGE",
-            found=f"a link for {hours:g} hours",
-            expected=f"more than 0 and at most {MOST_HOURS:g}",
-            next_step="make a link for each day of filming",
-        )
+        found = f"a link for {hours:g} hours"
+        raise PblError("USAGE", found, f"more than 0 and at most {MOST_HOURS:g}", "make a link for each day of filming")
     key, now = secrets.token_urlsafe(32), utc_now()
 
     def insert() -> int:
@@ -152,8 +145,8 @@ def phone_of(cookie: str) -> Phone:
     """Return the phone with a cookie. Raises `PblError` PHONE_LINK if its link has ended or never was."""
     link = _valid(PhoneLink & {"link_phone_sha256": hashed(cookie)})
     visit = (session.Session & {"session_id": link["session_id"]}).fetch1()
-    number = int(link["session_id"])
-    return Phone(int(link["phone_link"]), number, visit["subject"], visit["session_label"], link["link_expires"])
+    where = int(link["session_id"]), visit["subject"], visit["session_label"]
+    return Phone(int(link["phone_link"]), *where, link["link_expires"], link["link_by"])
 
 
 def hashed(secret: str) -> str:
@@ -235,12 +228,9 @@ def recording(phone: Phone, number: int) -> Sent:
     """Return a recording of the phone's visit. Raises `PblError` DB_NOT_FOUND for that of another one."""
     rows = (PhoneRecording & {"phone_recording": number, "session_id": phone.session_id}).to_dicts()
     if not rows:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=f"no recording {number} of this visit",
-            expected="a recording that this visit's phone has begun to send",
-            next_step="load the page again: it begins the upload anew",
-        )
+        found = f"no recording {number} of this visit"
+        expected = "a recording that this visit's phone has begun to send"
+        raise PblError("DB_NOT_FOUND", found, expected, "load the page again: it begins the upload anew")
     return _sent(rows[0])
 
 

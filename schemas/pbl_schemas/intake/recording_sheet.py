@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import functools
+import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +16,7 @@ from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.progress import track
-from pbl_pipeline.sensors import Given, given_sensors, named
+from pbl_pipeline.sensors import Given, given_sensors, named, read_samples
 from pbl_pipeline.video import recorded_utc
 
 from .. import lab, session
@@ -20,7 +24,7 @@ from ..rows import rows_inside
 from ..subject_codes import day_of
 from ..video import CAMERA_MOTIONS
 from .records import Methods, VisitRecord
-from .registration import check_owner, insert_new, registered, resolve
+from .registration import check_owner, insert_new, read_together, registered, resolve
 from .sensors import NONE, Sensors
 from .sheets import (
     Imported,
@@ -47,6 +51,8 @@ COLUMNS = (
 #: Columns that name files.
 _FILES = ("file", "camera", "attitude", "depth", "imu")
 _ONE_VISIT = "one value; two visits need two labels"
+#: Copies of folders stay until their rows are inserted while so much room is left (bytes); else they are made again.
+_KEPT_FREE = 10 * 10**9
 
 
 def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = False) -> Imported:
@@ -58,6 +64,11 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     Raises `PblError` FILE_MISSING, SHEET_FORMAT: a sheet that cannot be read, unknown columns, no rows; SOLVER_UNKNOWN,
     NORM_UNKNOWN. What is wrong with a row is in the result.
     """
+    with contextlib.ExitStack() as copies:
+        return _ingest(sheet, methods, dry_run, copies)
+
+
+def _ingest(sheet: Path, methods: Methods | None, dry_run: bool, copies: contextlib.ExitStack) -> Imported:
     rows = _rows(sheet)
     chosen = resolve(methods or Methods())
     lines = [Line(row.where) for row in rows]
@@ -72,13 +83,16 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
         with line.about():  # the file also of a row that is refused: all errors are found together
             one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
             one.read()
-            one.sensors.remove_copies()  # those of all rows need not fit on the disk
+            copies.callback(one.sensors.remove_copies)
+            if dry_run or shutil.disk_usage(tempfile.gettempdir()).free < _KEPT_FREE:
+                one.sensors.remove_copies()  # those of all rows need not fit on the disk
             sha256, file = one.files[0].sha256, row.cells["file"]
             if (first := seen.setdefault(sha256, row.where)) != row.where:
                 with line.about():
                     raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
             if visit is None or line.errors:
                 one.complete(chosen)
+                read_together(one, {})
                 continue
             _check_day(one, line)
             if one.sensors.imu:
@@ -93,6 +107,7 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
                 line.kept += ", without the sensor files of this row: pbl ingest FILE --imu ..." if one.sensors else ""
             else:
                 one.complete(chosen)
+                read_together(one, {})
                 new.append((row, line, one))
                 line.changes = [f"{file}: new: {visit.subject}/{visit.session_label}"]
     done = not dry_run and not any(line.errors for line in lines)
@@ -214,8 +229,9 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
 def _recording(row: Row, visit: VisitRecord, folder: Path) -> OneCamera:
     """Return the record of a row. Raises what `given_sensors` and `named` raise."""
     log, depth, imu = ("" if (text := row.cells.get(k, "")) == NONE else text for k in ("attitude", "depth", "imu"))
-    worn = [sensor for one in given_sensors(imu, folder) for sensor in named(one)] if imu else ()
-    sensors = Sensors(folder / log if log else None, DepthFile.of(depth, folder) if depth else None, worn)
+    read = functools.cache(read_samples)
+    worn = [sensor for one in given_sensors(imu, folder) for sensor in named(one, read)] if imu else ()
+    sensors = Sensors(folder / log if log else None, DepthFile.of(depth, folder) if depth else None, worn, read)
     return OneCamera(folder / row.cells["file"], visit, sensors)
 
 

@@ -143,9 +143,9 @@ class File:
     camera: Mapping[str, Any] | None = None
 
     @classmethod
-    def of(cls, path: Path) -> File:
-        """Read the bytes of a file. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
-        hold."""
+    def of(cls, path: Path, sha256: str = "") -> File:
+        """Read the bytes of a file, unless their `sha256` is known. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE
+        for a path that no row can hold."""
         from pbl_pipeline.video import check_file
 
         if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
@@ -153,7 +153,7 @@ class File:
         check_path(path)
         if not path.stat().st_size:
             raise _no_video("VIDEO_EMPTY", "0 bytes", path)
-        return cls(path, sha256_of(check_file(path)), path.stat().st_size)
+        return cls(path, sha256 or sha256_of(check_file(path)), path.stat().st_size)
 
 
 class Recording:
@@ -164,6 +164,7 @@ class Recording:
 
     visit: VisitRecord
     files: tuple[File, ...] = ()  # what `read` read
+    sensors: Any = None  # `Sensors` of videos
     markers: ClassVar[bool] = False  # whether it goes straight to the fit, without tracking and keypoints
 
     @property

@@ -193,13 +193,9 @@ def add_trial(
         )
     if len(rows) > 1 or rows[0]["fit_set_kind"] == fit.SINGLE:
         kinds = ", ".join(f"{r['fit_set_kind']} by {r['fit_method']}" for r in rows)
-        raise PblError(
-            "USAGE",
-            found=f"video_id {trial}: {kinds}",
-            expected="one fit, of several cameras or of markers",
-            next_step="name the method of the fit, or a trial whose fit can be a reference",
-            key=f"video_id={trial}",
-        )
+        found = f"video_id {trial}: {kinds}"
+        next_step = "name the method of the fit, or a trial whose fit can be a reference"
+        raise PblError("USAGE", found, "one fit, of several cameras or of markers", next_step, key=f"video_id={trial}")
     (row,) = rows
     said = origin or f"fit of video_id {trial}, set {row['fit_set']}, {row['fit_method']}"
     with stored_file(file_ref(row["trial_file"])) as path:
@@ -251,10 +247,6 @@ def find_video(about: int | str | Path) -> int:
             next_step="name it by its number",
             key=text,
         )
-    raise PblError(
-        "DB_NOT_FOUND",
-        found="no such video",
-        expected="number, path or file name of a registered video",
-        next_step="register it first: `pbl ingest`, which prints the number",
-        key=text,
-    )
+    expected = "number, path or file name of a registered video"
+    next_step = "register it first: `pbl ingest`, which prints the number"
+    raise PblError("DB_NOT_FOUND", "no such video", expected, next_step, key=text)

@@ -159,8 +159,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
         except PblError as error:
             done += [Registered(path, "refused", error=error) for path in recording.paths]
         finally:
-            if sensors := getattr(recording, "sensors", None):
-                sensors.remove_copies()
+            if recording.sensors:
+                recording.sensors.remove_copies()
     if len(done) > PART:
         catalog.analyse()
     return done
@@ -170,6 +170,7 @@ def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> lis
     if known := registered(one.files):
         return _update(one, known, chosen, named)
     one.complete(chosen)
+    read_together(one, {})
     try:
         return insert_new([one], chosen, lambda: bool(registered(one.files)))
     except DuplicateError:
@@ -183,6 +184,16 @@ def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
     videos = video.Video * session.Session.proj("subject", "session_label")
     rows = rows_inside(videos, "video_sha256", (file.sha256 for file in files))
     return {row["video_sha256"]: row for row in rows}
+
+
+def read_together(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
+    """Read the logs of wearable sensors of a recording with those of its visit, outside of a transaction. Raises
+    `PblError` as `Sensors.at_visit`. `known`: `registered` of its files."""
+    if one.sensors and one.sensors.imu:
+        label = {"subject": one.visit.subject, "session_label": one.visit.session_label}
+        visits = [{"session_id": row["session_id"]} for row in known.values()]
+        visits = visits or [session.Session & session.as_registered(label)]
+        one.sensors = one.sensors.at_visit(*fit.worn_logs(visits))
 
 
 def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
@@ -210,7 +221,7 @@ def insert_new(
     numbers = iter(result.video_id for result in done)
     for one in recordings:
         first, *_ = (next(numbers) for _ in one.files)
-        if getattr(one, "sensors", None):
+        if one.sensors:
             forget_errors(int(first or 0))  # fits of the visit may have failed by its older sensors
     return done
 
@@ -267,6 +278,7 @@ def _update(
     """Add what is new to a recording whose bytes are registered."""
     check_owner(one, known)
     one.check_known([known[file.sha256] for file in one.files if file.sha256 in known])
+    read_together(one, known)
     return [_update_file(one, file, known[file.sha256], chosen, named) for file in one.files]
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
+import json
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +26,7 @@ from .records import usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.depth import DepthFile
-    from pbl_pipeline.sensors import Given
+    from pbl_pipeline.sensors import Given, Read
     from pbl_pipeline.video import PhoneLog
 
 #: As a path of `--attitude`, `--depth` or `--imu`: none for this video or at its visit, or no longer.
@@ -43,14 +45,18 @@ class Kept(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Sensors:
     """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; depth: a recording, or
-    `NONE`; imu: sensors that the person wore at its visit; kept: what goes to the store of each kind and path, once
-    they were read; room: the folder of their copies, until `remove_copies`."""
+    `NONE`; imu: sensors that the person wore at its visit; samples: reads a log of them once, None: `read` makes it;
+    kept: what goes to the store of each kind and path, once they were read; room: the folder of their copies, until
+    `remove_copies`; together: the logs of the visit that were read together (`at_visit`); notes: on these."""
 
     attitude: Path | None = None
     depth: DepthFile | None = None
     imu: Sequence[Given] = ()
+    samples: Read | None = None
     kept: Mapping[tuple[str, Path], Kept] = dataclasses.field(default_factory=dict)
     room: TemporaryFolder | None = None
+    together: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
     def __bool__(self) -> bool:
         return self.attitude is not None or self.depth is not None or bool(self.imu)
@@ -60,24 +66,31 @@ class Sensors:
         """True if a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
-    def read(self, read_sensors: Callable[..., Any] | None = None) -> tuple[Sensors, PhoneLog | None]:
+    def read(self) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
         the sensors in them and what is kept of them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG;
         FILE_FORMAT for a file without bytes; DEPTH_FILE, PACKAGE_MISSING as `check_recording` and `pack`; SENSOR_LOG,
-        USAGE as `read_given` (or `read_sensors`, in its place); USAGE for a name that cannot be kept; STORE_FULL: no
-        room for the zip of a folder.
+        USAGE as `sensors_in`, `once`; USAGE for a name that cannot be kept; STORE_FULL: no room to zip a folder.
         """
-        from pbl_pipeline.sensors import read_given
+        from pbl_pipeline.sensors import once, read_samples, sensors_in
         from pbl_pipeline.video import read_phone_log
 
         for prefix, path in self._there():
             check_label(f"name of the {_KINDS[prefix]}", path.name, 255)
             if prefix != "attitude" and not path.is_dir():
                 _check_there(path)
-        logs = iter((read_sensors or read_given)([given for given in self.imu if given.segment is not None]))
-        imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
+        samples = self.samples or functools.cache(read_samples)
+        found = iter(once(sensors_in([given for given in self.imu if given.segment is not None], samples)))
+        imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(found)[1].name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        return dataclasses.replace(self, imu=imu, kept={}).packed(), log
+        return dataclasses.replace(self, imu=imu, kept={}, samples=samples).packed(), log
+
+    def at_visit(self, logs: Sequence[dict[str, Any]], recorded: Mapping[str, str | None]) -> Sensors:
+        """These files, which `read` read, after their logs of wearable sensors were read with those that stay at their
+        visit (`fit.worn_logs`), as its fit does: outside of a transaction. Raises `PblError` as `fit.read_worn`."""
+        after, _, changed = _with(logs, self.imu, self.kept)
+        notes = fit.read_worn(after, recorded, self.samples)[1] if changed else ()
+        return dataclasses.replace(self, together=_state(after), notes=notes, samples=None)
 
     def _there(self) -> list[tuple[str, Path]]:
         files = [("attitude", self.attitude), ("depth", self.depth and self.depth.file)]
@@ -115,8 +128,8 @@ class Sensors:
 
 
 def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
-    """Insert what the video does not have yet, of files that were read (`Sensors.read`); returns it in words. Call it
-    in a transaction.
+    """Insert what the video does not have yet, of files that were read (`Sensors.read`, `Sensors.at_visit`); returns it
+    in words. Call it in a transaction. Raises `PblError` DECIDED_MEANWHILE for other logs at the visit than were read.
 
     Another log or recording (or none) takes the older one's place, and what was computed with that is deleted: with a
     phone's log keypoints and after, with depths the fit and after.
@@ -127,12 +140,12 @@ def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
         done += _attach_log(key, given.attitude, given.kept, log)
     if given.depth is not None:
         done += _attach_depth(key, given.depth, given.kept)
-    return done + _attach_sensors(key, given.imu, given.kept)
+    return done + _attach_sensors(key, given)
 
 
 def attach_worn(session_id: int, worn: Sensors) -> list[str]:
     """Attach logs of wearable sensors, which were read, to a visit that has a video; returns it in words. Raises
-    `PblError` USAGE without a video, what `keep_files` and `fit.check_sensors` raise."""
+    `PblError` USAGE without a video, what `keep_files` and `attach` raise."""
     videos = (video.Video & {"session_id": session_id}).to_arrays("video_id")
     if not len(videos):
         raise usage("sensors of a visit without a recording", "at least one recording", next_step="film first")
@@ -195,22 +208,19 @@ def _attach_depth(key: dict[str, Any], given: DepthFile, kept: Mapping[tuple[str
     return done
 
 
-def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[tuple[str, Path], Kept]) -> list[str]:
-    """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them. A log
-    of a segment takes the place of the visit's older one. Raises what `fit.check_sensors` raises for all together."""
-    if not given:
-        return []
+def _with(
+    logs: Sequence[dict[str, Any]], given: Sequence[Given], kept: Mapping[tuple[str, Path], Kept]
+) -> tuple[list[dict[str, Any]], list[str], bool]:
+    """Return the logs of wearable sensors of a visit (`fit.worn_logs`) after others came, of which one of a segment
+    takes the place of the older one; new ones have no key yet. Also what was done, in words, and whether the fit of the
+    visit reads others than before."""
     files: dict[tuple[Path, float | None], tuple[dict[str, str], dict[str, str]]] = {}
     for one in given:
         own, mounts = files.setdefault((one.file, one.rate_hz), ({}, {}))
         own |= {} if one.segment is None else {one.segment: one.sensor or ""}
         mounts |= {one.segment: one.mount} if one.segment and one.mount else {}
-    visit = int((video.Video & key).fetch1("session_id"))
-    session.lock(visit)  # no fit is inserted from here on
-    of_visit = video.WearableImu & (video.Video & {"session_id": visit}).proj()
-    done, worn = [], False
+    rows, done, changed = list(logs), [], False
     for (file, rate), (own, mounts) in files.items():
-        rows = of_visit.to_dicts()
         sha256 = None if str(file) == NONE else kept["imu", file].sha256
         if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
             before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
@@ -218,50 +228,91 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given], kept: Mapping[t
             own, mounts = others | own, {s: m for s, m in (same["imu_mounts"] or {}).items() if s in others} | mounts
             if (before, same["imu_rate"], same["imu_mounts"] or {}) == (own, rate, mounts):
                 continue
-        replaced = []
-        for row in rows:
-            this = {k: row[k] for k in video.WearableImu.primary_key}
+        rows, older, replaced = [], rows, []
+        for row in older:
             segments = row["imu_segments"] or {}
             left = {s: name for s, name in segments.items() if s not in own}
-            if sha256 in (None, row["imu_sha256"]) or (segments and not left):
-                (video.WearableImu & this).delete(prompt=False)
-            elif left != segments:
-                still = {s: m for s, m in (row["imu_mounts"] or {}).items() if s in left}
-                video.WearableImu.update1({**this, "imu_segments": left, "imu_mounts": still or None})
-            worn |= left != segments or (sha256 is None and bool(segments))
+            changed |= left != segments or (sha256 is None and bool(segments))
             replaced += [row["imu_name"]] if left != segments and row["imu_sha256"] != sha256 else []
+            if sha256 not in (None, row["imu_sha256"]) and (left or not segments):
+                still = {s: m for s, m in (row["imu_mounts"] or {}).items() if s in left}
+                rows.append(row if left == segments else row | {"imu_segments": left, "imu_mounts": still or None})
         if sha256 is None:
-            done += ["the wearable sensors were removed"] if rows else []
+            done += ["the wearable sensors were removed"] if older else []
             continue
-        number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
         about = {"imu_segments": own or None, "imu_rate": rate, "imu_mounts": mounts or None}
-        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, kept, about)
+        rows.append({"imu_name": file.name, "imu_sha256": sha256, "imu_file": file, **about})
         where = "kept and not read: no segment of the body is known"
         where = said("sensors on {segments}", segments=joined(sorted(own))) if own else where
         instead = said(" instead of {names}", names=", ".join(replaced)) if replaced else ""
-        done.append(
-            said(
-                "wearable IMU file {name} was attached{instead}, {where}", name=file.name, instead=instead, where=where
-            )
-        )
-        worn |= bool(own)
-    if worn:
-        done += fit.check_sensors(visit)
+        name = file.name
+        text = said("wearable IMU file {name} was attached{instead}, {where}", name=name, instead=instead, where=where)
+        done.append(text)
+        changed |= bool(own)
+    return rows, done, changed
+
+
+def _attach_sensors(key: dict[str, Any], given: Sensors) -> list[str]:
+    """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them."""
+    if not given.imu:
+        return []
+    visit = int((video.Video & key).fetch1("session_id"))
+    session.lock(visit)  # no fit is inserted from here on
+    before = fit.worn_logs({"session_id": visit})[0]
+    logs, done, changed = _with(before, given.imu, given.kept)
+    if changed:
+        _check_read(logs, given.together)
+    stay = {(row["video_id"], row["imu"]): row for row in logs if "imu" in row}
+    for row in before:
+        of_row, now = {k: row[k] for k in video.WearableImu.primary_key}, stay.get((row["video_id"], row["imu"]))
+        if now is None:
+            (video.WearableImu & of_row).delete(prompt=False)
+        elif now is not row:
+            video.WearableImu.update1(of_row | {k: now[k] for k in ("imu_segments", "imu_mounts")})
+    for row in (row for row in logs if "imu" not in row):
+        number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
+        about = {k: row[k] for k in ("imu_segments", "imu_rate", "imu_mounts")}
+        _keep(video.WearableImu, "imu", {**key, "imu": number}, row["imu_file"], given.kept, about)
+    if changed:
+        done += given.notes
         if rows := counted(fit.delete_sensor_fits(visit)):
             done.append(said("what was fitted without them was deleted: {rows}", rows=rows))
     return done
 
 
-def hand_on(numbers: Sequence[int], old: int, new: int) -> None:
+def _state(logs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what a fit reads of the logs of wearable sensors of a visit, to be compared."""
+    read = ("imu_sha256", "imu_segments", "imu_rate", "imu_mounts")
+    return sorted(json.dumps([log[c] or None for c in read], sort_keys=True) for log in logs if log["imu_segments"])
+
+
+def _check_read(logs: Sequence[Mapping[str, Any]], together: Sequence[str]) -> None:
+    if _state(logs) != together:
+        found = "other logs of wearable sensors came to this visit meanwhile"
+        expected = "those that were read together with these; nothing was written"
+        raise PblError("DECIDED_MEANWHILE", found, expected, "do it again")
+
+
+def read_carried(numbers: Sequence[int], subject: str, session_label: str) -> list[str]:
+    """Read the logs of wearable sensors that these videos take along to a visit with those that it has, outside of a
+    transaction. Returns what `hand_on` compares. Raises `PblError` as `fit.read_worn`."""
+    visit = session.Session & {"subject": subject, "session_label": session_label}
+    logs, recorded = fit.worn_logs([visit, *({"video_id": n} for n in numbers)])
+    fit.read_worn(logs, recorded)
+    return _state(logs)
+
+
+def hand_on(numbers: Sequence[int], old: int, new: int, read: Sequence[str]) -> None:
     """Give the logs of wearable sensors of videos that were moved to another video of their old visit; without one they
-    stay, and the fits of the new visit are deleted. Call it in a transaction. Raises what `fit.check_sensors` raises.
+    stay, and the fits of the new visit are deleted. Call it in a transaction. Raises `PblError` DECIDED_MEANWHILE
+    unless the new visit has the logs that were `read` (`read_carried`).
     """
     if not (carried := carriers(numbers)):
         return
     session.lock(new)
     heirs = (video.Video & {"session_id": old}).to_arrays("video_id")
     if not len(heirs):
-        fit.check_sensors(new)
+        _check_read(fit.worn_logs({"session_id": new})[0], read)
         fit.delete_sensor_fits(new)
         return
     heir, table = int(min(heirs)), video.WearableImu.full_table_name
@@ -327,21 +378,11 @@ def _check_there(path: Path) -> None:
     except OSError:
         size = -1
     if size < 0:
-        raise PblError(
-            "FILE_MISSING",
-            found="no such file, or it cannot be read",
-            expected="a file to keep with the video",
-            next_step="check the path",
-            key=str(path),
-        )
+        about = "no such file, or it cannot be read", "a file to keep with the video", "check the path"
+        raise PblError("FILE_MISSING", *about, key=str(path))
     if size == 0:
-        raise PblError(
-            "FILE_FORMAT",
-            found="0 bytes",
-            expected="a file as the app or the instrument wrote it",
-            next_step="copy it again",
-            key=str(path),
-        )
+        about = "0 bytes", "a file as the app or the instrument wrote it", "copy it again"
+        raise PblError("FILE_FORMAT", *about, key=str(path))
 
 
 def _utc(log: PhoneLog) -> str | None:

@@ -92,13 +92,7 @@ def read_sheets(path: Path) -> list[Sheet]:
     error values, no such file format. Cells beside the header's columns are an error of their row.
     """
     if not path.is_file():
-        raise PblError(
-            "FILE_MISSING",
-            found="no such file",
-            expected="a sheet, .csv or .xlsx",
-            next_step="check the path",
-            key=path,
-        )
+        raise PblError("FILE_MISSING", "no such file", "a sheet, .csv or .xlsx", "check the path", key=path)
     try:
         tables = _workbook(path) if path.suffix.lower() in (".xlsx", ".xlsm") else [(path.name, _csv(path))]
     except (ValueError, OSError, csv.Error) as error:

@@ -50,12 +50,8 @@ def incoming_url() -> str:
     set."""
     value = os.environ.get("PBL_INCOMING")
     if not value:
-        raise PblError(
-            "USAGE",
-            found="PBL_INCOMING is not set",
-            expected="the folder or s3://BUCKET/PREFIX into which recordings are uploaded, as SUBJECT/SESSION/FILE",
-            next_step="set it, or leave `pbl cron import` out",
-        )
+        expected = "the folder or s3://BUCKET/PREFIX into which recordings are uploaded, as SUBJECT/SESSION/FILE"
+        raise PblError("USAGE", "PBL_INCOMING is not set", expected, "set it, or leave `pbl cron import` out")
     return value
 
 

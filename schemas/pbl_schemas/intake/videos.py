@@ -165,6 +165,7 @@ class OneCamera(Recording):
     path: Path
     visit: VisitRecord
     sensors: Sensors = dataclasses.field(default_factory=Sensors)
+    sha256: str = ""  # of its bytes, where they were hashed as they were written
     log: PhoneLog | None = dataclasses.field(default=None, init=False)
 
     @property
@@ -176,7 +177,7 @@ class OneCamera(Recording):
         return self.visit.camera_motion or ("handheld" if self.sensors.has_log else "static")
 
     def read(self) -> None:
-        self.files = (File.of(*self.paths),)  # no picture is decoded
+        self.files = (File.of(self.paths[0], self.sha256),)  # no picture is decoded
         self.sensors, self.log = self.sensors.read()
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:

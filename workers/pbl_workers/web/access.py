@@ -259,12 +259,9 @@ def host_name(stated: str) -> str:
     except UnicodeError:
         name = ""
     if not _HOST.fullmatch(name):
-        raise PblError(
-            "USAGE",
-            found=f"the name of a host {ascii(stated)[:100]}",
-            expected="a name such as gait.example.org, or an address, without https:// and port",
-            next_step="correct --hostname, or the name of this machine",
-        )
+        found = f"the name of a host {ascii(stated)[:100]}"
+        expected = "a name such as gait.example.org, or an address, without https:// and port"
+        raise PblError("USAGE", found, expected, "correct --hostname, or the name of this machine")
     return name
 
 

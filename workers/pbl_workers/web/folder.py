@@ -57,13 +57,9 @@ class ResultsFolder(Source):
     def __init__(self, path: Path, videos: Path | None = None) -> None:
         found = sorted(_visits(path, _DEEP))[:_MOST]
         if not found:
-            raise PblError(
-                "FILE_MISSING",
-                found=f"no {SESSION} and no fit in {path}",
-                expected="a folder that `pbl run` wrote, or a folder of such folders",
-                next_step="`pbl run VIDEO --out FOLDER`, then `pbl web --folder FOLDER`",
-                key=str(path),
-            )
+            expected = "a folder that `pbl run` wrote, or a folder of such folders"
+            next_step = "`pbl run VIDEO --out FOLDER`, then `pbl web --folder FOLDER`"
+            raise PblError("FILE_MISSING", f"no {SESSION} and no fit in {path}", expected, next_step, key=str(path))
         self._videos, number = videos, 0
         self._places: dict[int, _Place] = {}
         for i, folder in enumerate(found, 1):

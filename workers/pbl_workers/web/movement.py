@@ -173,13 +173,9 @@ def _packed(channels: np.ndarray, name: str) -> bytes:
     again = changes.copy()
     again[:, 2:] -= changes[:, 1:-1]
     if np.abs(again).max(initial=0) > 32767:
-        raise PblError(
-            "FILE_FORMAT",
-            found="a body that is metres away from one frame to the next",
-            expected="the movement of a person",
-            next_step="look at the checks of the fit; fit the recording again",
-            key=name,
-        )
+        found = "a body that is metres away from one frame to the next"
+        next_step = "look at the checks of the fit; fit the recording again"
+        raise PblError("FILE_FORMAT", found, "the movement of a person", next_step, key=name)
     return again.astype("<i2").view(np.uint8).reshape(-1, 2).T.tobytes()
 
 

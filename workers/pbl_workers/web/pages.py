@@ -177,6 +177,10 @@ def refused(request: Request, reason: str) -> Response:
 
 
 def error(request: Request, error: PblError, status: int) -> Response:
+    if as_json(request) and getattr(request.state, "phone", None) is not None:  # its page shows these words
+        said = functools.partial(texts.on_page, reader_language(request))
+        found, expected, next_step = (said(part).striptags() for part in (error.found, error.expected, error.next_step))
+        error = PblError(error.code, found, expected, next_step, error.key)
     return show(request, "error.html", status, error=error)
 
 

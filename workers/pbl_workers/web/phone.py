@@ -14,7 +14,6 @@ import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 import segno
@@ -25,22 +24,21 @@ from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Re
 
 from pbl_pipeline import texts
 from pbl_pipeline.bounded import parse_json
-from pbl_pipeline.errors import PblError, joined
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
-from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.words import capital
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
-from pbl_schemas.intake.phone_recordings import MOST_HOURS, MOST_LOG_BYTES, PART_BYTES, Phone, Sent
+from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import steps_of
-from pbl_schemas.intake.sensors import attach_worn
 from pbl_schemas.operations.archive import UNFINISHED_DAYS
 from pbl_schemas.reading.usable import PENDING, Next, Usable, next_pass, usual_seconds
 from pbl_schemas.reading.visit_state import RESULTS, state_of
 
 from .. import phone_uploads
-from . import certificates, pages, site
+from ..browser_uploads import Place
+from . import certificates, pages, registration, site
 from .access import BODY_BYTES, Refused, form_of, read_body, read_form, sender
 from .address import FILM, OPEN, Address, number_of
 from .computing import begin as compute
@@ -196,20 +194,16 @@ async def authority(request: Request) -> Response:
 
 
 async def worn(request: Request) -> Response:
-    """Take the log of a wearable sensor, whose name and segment the headers state."""
-    body = await _body(request, "application/octet-stream", MOST_LOG_BYTES)
-    phone, headers = request.state.phone, request.headers
-    name, segment = unquote(headers.get("x-name", "")), headers.get("x-segment", "")
-    if segment not in ("", *SEGMENTS):
-        raise Refused("form")
-    with new_folder() as folder:
-        given = await _on_disk(phone_uploads.read_log, folder, name, segment, body)
-        done = await site.ask(request, attach_worn, phone.session_id, given)
-    with contextlib.suppress(PblError):  # others wait
-        compute(request, phone.session_id, False)
-    language = reader_language(request)
-    said = texts.library_words(language, joined(done, "; ")) if done else texts.text(language, "upload.known")
-    return JSONResponse({"said": said})
+    """Take logs of wearable sensors, as the page that adds recordings to a visit does."""
+    phone: Phone = request.state.phone
+    to = Place(phone.session_id, phone.subject, phone.label, phone.by, phone.link)
+    _, outcomes = await registration.received(request, to)
+    if any(one.status == "registered" for one in outcomes):
+        with contextlib.suppress(PblError):  # others wait
+            compute(request, phone.session_id, False)
+    said = functools.partial(registration.words, reader_language(request))
+    told = [{"name": one.name, "taken": one.error is None, "said": said(one).striptags()} for one in outcomes]
+    return JSONResponse({"outcomes": told})
 
 
 class Phones:

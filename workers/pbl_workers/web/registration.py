@@ -7,13 +7,17 @@ import datetime
 import functools
 from collections.abc import Mapping, Sequence
 
+from markupsafe import Markup, escape
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
+from pbl_pipeline.words import capital
 from pbl_schemas import lab
+from pbl_schemas.fit import worn_logs
 from pbl_schemas.intake import Sensors
 from pbl_schemas.studies import visit_forms
 
@@ -32,16 +36,9 @@ from .tables import on_disk
 _BLOCK, _WAIT_S = 2**20, 60.0
 _NEXT_STEP = "tell who runs the server"
 _on_disk = functools.partial(on_disk, _NEXT_STEP)
-_busy = functools.partial(
-    PblError,
-    "DB_REFUSED",
-    found="recordings of the drop folder are being taken over",
-    expected="one import at a time",
-    next_step="send it again in some minutes",
-)
-_no_file = functools.partial(
-    PblError, "USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it"
-)
+_BUSY = "recordings of the drop folder are being taken over", "one import at a time", "send it again in some minutes"
+_NO_FILE = "no file", "at least one video", "choose a video, then send it"
+_NO_LOG = "no file", "logs of sensors", "choose the logs, all of them together"
 
 
 async def new(
@@ -94,47 +91,70 @@ def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes
 
     values = {"activity": "walking", "pace": "", "segment": "", **values}
     more = {"choices": {"activity": ACTIVITIES, "pace": PACES}, "accepted": ", ".join(VIDEO_ENDINGS)}
-    more["segments"] = SEGMENTS
+    more |= {"segments": SEGMENTS, "words": functools.partial(words, reader_language(request))}
     return pages.show(request, "upload.html", to=to, values=values, outcomes=outcomes, **more)
+
+
+def words(language: str, one: Received) -> Markup:
+    """Return what was done with a file that was sent, or why it is refused and what to do."""
+    on_page = functools.partial(texts.on_page, language)
+    if one.error is None:
+        done = texts.text(language, f"upload.{'registered' if one.status == 'registered' else 'known'}")
+        return Markup("{}: {}").format(done, on_page(one.note)) if one.note else escape(done)
+    if one.error.found.startswith("a photo"):
+        return escape(texts.text(language, "upload.photo"))
+    if not one.worn and (name := f"upload.{one.error.code}") in texts.catalogue():
+        return Markup("{} ({})").format(texts.text(language, name), on_page(one.error.found))
+    found, more = on_page(one.error.found), on_page(one.error.next_step, False) or on_page(one.error.next_step)
+    return Markup("{}. {}.").format(found if one.name else capital(found), capital(more.rstrip(".")))
 
 
 async def send(request: Request) -> Response:
     if not is_multipart(request):
         await form_of(request)
         raise Refused("form")
-    to = await site.ask(request, browser_uploads.place, number_of(request))
+    to = await site.ask(request, browser_uploads.place, number_of(request), sender(request))
+    stated, outcomes = await received(request, to)
+    if all(one.status == "registered" and not one.note for one in outcomes):
+        return RedirectResponse(f"/visits/{to.session_id}", 303)
+    return upload_page(request, to, stated, outcomes)
+
+
+async def received(request: Request, to: Place) -> tuple[dict[str, str], list[Received]]:
+    """Take in the files of a form; returns what it states of them, and their outcomes. Of a phone, which has no token,
+    logs of wearable sensors alone. Raises as `_receive`."""
     request.scope.get(MORE_TIME, lambda: None)()
-    await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
+    await _on_disk(check_room, whole_number(request.headers.get("content-length", "0")) or 0, _NEXT_STEP)
     arriving: list[Arriving] = []
     try:
         fields, outcomes, whole = await _receive(request, to, arriving)
         stated = {name: fields[name][:100] for name in ("activity", "pace", "segment") if name in fields}
         if (segment := stated.get("segment", "")) not in ("", *SEGMENTS):
             raise Refused("form")
-        good, worn, refused = await _on_disk(browser_uploads.check, whole, segment)
+        of_visit = await site.ask(request, worn_logs, {"session_id": to.session_id})
+        good, worn, refused = await _on_disk(browser_uploads.check, whole, segment, of_visit)
         outcomes += refused
         if not whole and not outcomes:
-            outcomes.append(Received("", "refused", error=_no_file()))
+            nothing = PblError("USAGE", *(_NO_LOG if "segment" in stated else _NO_FILE))
+            outcomes.append(Received("", "refused", error=nothing, worn="segment" in stated))
         outcomes += await taken_in(request, to, good, worn, stated)
     finally:
         for one in arriving:
             await asyncio.to_thread(one.discard)
-    if all(one.status == "registered" and not one.note for one in outcomes):
-        return RedirectResponse(f"/visits/{to.session_id}", 303)
-    return upload_page(request, to, stated, outcomes)
+    return stated, outcomes
 
 
 async def taken_in(
     request: Request, to: Place, good: list[tuple[Arriving, Copy]], worn: Sensors, stated: Mapping[str, str]
 ) -> list[Received]:
     for _ in range(int(_WAIT_S) if good or worn else 0):
-        said = stated.get("activity", ""), stated.get("pace", ""), sender(request)
+        said = stated.get("activity", ""), stated.get("pace", "")
         done = await site.ask(request, browser_uploads.register, to, good, worn, *said)
         if done is not None:
             return done
         await asyncio.sleep(1.0)
     names = [one.name for one, _ in good] + [one.file.name for one in worn.imu]
-    return [Received(name, "refused", error=_busy(key=name)) for name in dict.fromkeys(names)]
+    return [Received(name, "refused", error=PblError("DB_REFUSED", *_BUSY, key=name)) for name in dict.fromkeys(names)]
 
 
 ROUTES = [
@@ -152,7 +172,7 @@ async def _receive(
 ) -> tuple[dict[str, str], list[Received], list[tuple[Arriving, Copy]]]:
     """Return the fields of a form, the files that are refused immediately, and those that are on disk.
 
-    `arriving` gets every file that was begun. Nothing is written before the form's token was read.
+    `arriving` gets every file that was begun. Nothing is written before the form's token was read (not of a phone).
 
     Raises `Refused` "token", "form", "size"; `PblError` USAGE, UPLOAD_REFUSED, FILE_UNWRITABLE.
     """
@@ -162,6 +182,7 @@ async def _receive(
     text: bytearray | None = None
     file: Arriving | None = None
     kept = bytearray()
+    check = functools.partial(check_token, request) if to.link is None else lambda _: None
 
     async def end() -> None:
         if file is not None:
@@ -186,12 +207,14 @@ async def _receive(
         if found.file is None:
             text = fields[found.name] = bytearray()
         elif found.file:  # an empty one: nothing was chosen
-            check_token(request, fields.get("token", bytearray()).decode(errors="replace"))
+            check(fields.get("token", bytearray()).decode(errors="replace"))
+            if to.link is not None and found.name != "worn":
+                raise Refused("form")
             file = await _begin(to, found, outcomes)
             arriving += [] if file is None else [file]
     await end()
     stated = {name: bytes(value).decode(errors="replace") for name, value in fields.items()}
-    check_token(request, stated.pop("token", ""))
+    check(stated.pop("token", ""))
     check_fields(stated)
     return stated, outcomes, whole
 

@@ -93,12 +93,9 @@ def overlay_key(video_id: int) -> tuple[Any, ...]:
     Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit."""
     about = reading.shown_recording(video_id)
     if not about.recording.fitted or about.recording.path is None:
-        raise PblError(
-            "DB_NOT_FOUND",
-            found=joined([said("no pictures with a fit of recording {n}.", n=video_id), about.recording.problem], " "),
-            expected="a recording to which a body is fitted",
-            next_step="`pbl populate`; `pbl why` says what stops it",
-        )
+        found = joined([said("no pictures with a fit of recording {n}.", n=video_id), about.recording.problem], " ")
+        expected = "a recording to which a body is fitted"
+        raise PblError("DB_NOT_FOUND", found, expected, "`pbl populate`; `pbl why` says what stops it")
     return ("overlay", video_id, *reading.computations(video_id), about.hidden_heads, privacy.copy_of(video_id))
 
 

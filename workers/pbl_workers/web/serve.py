@@ -77,12 +77,9 @@ class Where:
     def check(self) -> None:
         """Raise `PblError` where this cannot be served safely: WEB_TLS; USAGE for what does not belong together."""
         if (self.tls_cert is None) != (self.tls_key is None) or (self.tls_cert is not None and self.behind_proxy):
-            raise PblError(
-                "USAGE",
-                found="--tls-cert without --tls-key, or the other way round, or beside --behind-proxy",
-                expected="both files where the page itself speaks TLS, or --behind-proxy where a proxy does",
-                next_step="name both or neither",
-            )
+            found = "--tls-cert without --tls-key, or the other way round, or beside --behind-proxy"
+            expected = "both files where the page itself speaks TLS, or --behind-proxy where a proxy does"
+            raise PblError("USAGE", found, expected, "name both or neither")
         if self.host not in LOOPBACK and self.tls_cert is None and not self.behind_proxy:
             raise PblError(
                 "WEB_TLS",
@@ -95,19 +92,13 @@ class Where:
         try:
             _ = ipaddress.ip_network(self.behind_proxy or "127.0.0.1", strict=False)
         except ValueError as error:
-            raise PblError(
-                "USAGE",
-                found=f"--behind-proxy {self.behind_proxy}",
-                expected="an address such as 127.0.0.1, or a network such as 172.18.0.0/16",
-                next_step="write the address from which the proxy connects",
-            ) from error
+            found = f"--behind-proxy {self.behind_proxy}"
+            expected = "an address such as 127.0.0.1, or a network such as 172.18.0.0/16"
+            raise PblError("USAGE", found, expected, "write the address from which the proxy connects") from error
         if self.by_accounts and not self.names - {*LOOPBACK}:
-            raise PblError(
-                "USAGE",
-                found="no name under which browsers reach the page",
-                expected="--hostname NAME, as often as there are names; requests under another name are refused",
-                next_step="add --hostname, such as --hostname gait.example.org",
-            )
+            found = "no name under which browsers reach the page"
+            expected = "--hostname NAME, as often as there are names; requests under another name are refused"
+            raise PblError("USAGE", found, expected, "add --hostname, such as --hostname gait.example.org")
         if self.tls_cert is not None:
             try:
                 self.tls()
@@ -151,28 +142,18 @@ def serve(
     where.check()
     check_label("--name", name, 64)
     if folder is not None and settings.audit_looks():
-        raise PblError(
-            "USAGE",
-            found="--folder with PBL_AUDIT_LOOKS",
-            expected="tables, in which each look at a recording leaves a row",
-            next_step="`pbl ingest` the recordings; or unset PBL_AUDIT_LOOKS if it is not required",
-        )
+        found = "--folder with PBL_AUDIT_LOOKS"
+        next_step = "`pbl ingest` the recordings; or unset PBL_AUDIT_LOOKS if it is not required"
+        raise PblError("USAGE", found, "tables, in which each look at a recording leaves a row", next_step)
     if folder is not None and where.by_accounts:
-        raise PblError(
-            "USAGE",
-            found="--folder for more than this machine",
-            expected="a folder of results on this machine alone: nothing says there who may see whom",
-            next_step="leave out --host, --tls-cert and --behind-proxy, or bring the recordings into tables",
-        )
+        expected = "a folder of results on this machine alone: nothing says there who may see whom"
+        next_step = "leave out --host, --tls-cert and --behind-proxy, or bring the recordings into tables"
+        raise PblError("USAGE", "--folder for more than this machine", expected, next_step)
     if where.by_accounts:
         accounts = accounts or Accounts()
         if not accounts.all():
-            raise PblError(
-                "WEB_ACCOUNT",
-                found="no accounts",
-                expected="at least one, with which a person can sign in",
-                next_step="pbl web account add NAME --role reviewer",
-            )
+            expected = "at least one, with which a person can sign in"
+            raise PblError("WEB_ACCOUNT", "no accounts", expected, "pbl web account add NAME --role reviewer")
     listening = _listen(where.host, where.port)
     port = listening.getsockname()[1]
     if where.by_accounts:
@@ -275,10 +256,6 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.listen()  # a browser that is quicker than the database waits, instead of being refused
     except OSError as error:
         listening.close()
-        raise PblError(
-            "WEB_PORT",
-            found=f"{host}:{port}: {error.strerror or error}",
-            expected="a free port",
-            next_step="pass another --port, or 0 for a free one; another `pbl web` may be running",
-        ) from error
+        next_step = "pass another --port, or 0 for a free one; another `pbl web` may be running"
+        raise PblError("WEB_PORT", f"{host}:{port}: {error.strerror or error}", "a free port", next_step) from error
     return listening

@@ -223,16 +223,18 @@ async function sendAll() {
 // Logs of wearable sensors, which an app or a computer wrote while it was filmed.
 $("[name=worn]").onchange = () => { $(".worn").hidden = !$("[name=worn]").checked; };
 $(".worn input").onchange = async () => {
-  const input = $(".worn input"), lines = $(".worn ul"), segment = $(".worn select").value;
-  for (const file of input.files) {
-    const headers = { "content-type": "application/octet-stream", "x-name": encodeURIComponent(file.name), "x-segment": segment };
-    const line = item(file.name, t("sending", { n: 0 }));
-    lines.prepend(line);
-    const said = await request("/phone/sensors.json", { method: "POST", headers, body: file }).then(
-      (told) => `\u2713 ${told.said}`, (error) => (error instanceof Refusal ? `${error.message}; ${error.expected}` : t("no_network")));
-    line.replaceWith(item(file.name, said));
-  }
-  input.value = "";
+  const lines = $(".worn ul"), { failed, gone } = $(".worn").dataset, body = new FormData(), names = [];
+  body.append("segment", $(".worn select").value);
+  for (const file of $(".worn input").files)
+    if (await file.slice(0, 1).arrayBuffer().catch(() => null)) body.append("worn", file), names.push(file.name);
+    else lines.prepend(item(file.name, gone));
+  $(".worn input").value = "";
+  if (!names.length) return;
+  const line = item(names.join(", "), t("sending", { n: 0 }));
+  lines.prepend(line);
+  const { outcomes } = await request("/phone/sensors.json", { method: "POST", body }).catch((error) => ({ outcomes: [
+    { name: names.join(", "), said: error instanceof Refusal ? `${error.message}; ${error.expected}` : failed }] }));
+  line.replaceWith(...outcomes.map((/** @type {any} */ one) => item(one.name, `${one.taken ? "\u2713 " : ""}${one.said}`)));
 };
 $("[name=worn]").onchange();
 
