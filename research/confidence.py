@@ -78,10 +78,13 @@ def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams])
 
 
 def curve_params(method: Method[KeypointParams]) -> dict:
-    """Return the dependencies of the confidence: the parameters less the curve's own name, and less the grid of the
-    crops, which moves them by less than the next frame does."""
+    """Return the dependencies of the confidence: the parameters less the curve's own name, less the grid of the crops,
+    which moves them by less than the next frame does, and less the interval of the frames: a recording at 60 frames/s
+    of which every second one is used is like one at 30."""
     params = json.loads(method.paramset.canonical_json)
-    return {name: value for name, value in params.items() if name not in ("confidence_curve", "crop_step_px")}
+    return {
+        name: value for name, value in params.items() if name not in ("confidence_curve", "crop_step_px", "interval_s")
+    }
 
 
 def fit_curve(

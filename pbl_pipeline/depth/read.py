@@ -93,7 +93,10 @@ def with_recordings(
             continue
         if not isinstance(trial, Keypoints):
             raise PblError("USAGE", "--depth with markers", "keypoints of a video", "leave out --depth")
-        depth = read_depth(given.file, trial.time_s, trial.image_size_px, given.scale_m, given.called)
+        time, frame = trial.time_s, trial.frame
+        if frame is not None:  # of those that the keypoints leave out as well: each has a depth picture
+            time = np.interp(np.arange(frame[-1] + 1), frame, time)
+        depth = read_depth(given.file, time, trial.image_size_px, given.scale_m, given.called)
         found.append(dataclasses.replace(trial, camera=depth.camera(trial.camera)))
         depths.append(at_points(depth, trial))
     return found, depths

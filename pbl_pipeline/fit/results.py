@@ -38,7 +38,7 @@ class TrialFit:
     the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
     keypoints, which tells their detector, "" if they have none or the file is from before it was kept. sensors: what
     was found of each wearable sensor, depth: of the trial's depth recording, if it has one. with_depths: depth
-    recordings set the scale, this trial's or another's.
+    recordings set the scale, this trial's or another's. frame (T,): number of each frame in the video, None: all of it.
     """
 
     name: str
@@ -70,6 +70,7 @@ class TrialFit:
     sensors: tuple[SensorFit, ...] = ()
     with_depths: bool = False
     depth: DepthFit | None = None
+    frame: np.ndarray | None = None
 
     @property
     def sized(self) -> bool:
@@ -102,6 +103,8 @@ class TrialFit:
             arrays["sensors"] = np.asarray(json.dumps(plain(self.sensors)))
         if self.depth is not None:
             arrays["depth"] = np.asarray(json.dumps(plain(self.depth)))
+        if self.frame is not None:
+            arrays["frame"] = np.asarray(self.frame)
         arrays["camera_matrix"] = np.asarray(self.camera.matrix)
         arrays["distortion"] = np.asarray(self.camera.distortion)
         arrays["camera_source"] = np.asarray(self.camera.source)
@@ -120,9 +123,10 @@ class TrialFit:
         }
         needed = [k for k in (*_ARRAYS, "camera_matrix", "distortion", "camera_source") if k not in later]
         next_step = "see docs/files.md, section fit.npz"
-        data = later | load_npz(path, later, needed, next_step)
-        check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
-        values = {k: data[k] for k in _ARRAYS}
+        data = later | load_npz(path, (*later, "frame"), needed, next_step)
+        shapes = _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size)
+        check_numbers(path, data, shapes | ({"frame": shapes["time_s"]} if "frame" in data else {}))
+        values: dict[str, Any] = {k: data[k] for k in _ARRAYS} | {"frame": data.get("frame")}
         try:
             values["sensors"] = tuple(from_json(SensorFit, s) for s in parse_json(text_of(path, data, "sensors")))
             depth = parse_json(text_of(path, data, "depth"))
@@ -155,7 +159,7 @@ class SessionFit(Solution):
 
 
 #: Fields of a trial that its file has as they are.
-_ARRAYS = [f.name for f in dataclasses.fields(TrialFit) if f.name not in ("camera", "sensors", "depth")]
+_ARRAYS = [f.name for f in dataclasses.fields(TrialFit) if f.name not in ("camera", "sensors", "depth", "frame")]
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

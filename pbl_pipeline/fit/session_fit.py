@@ -249,6 +249,7 @@ def _trial_fit(
         sensors=solution.sensors[i] if solution.sensors else (),
         with_depths=bool(solution.depths),
         depth=solution.depths[i] if solution.depths else None,
+        frame=view.frame if isinstance(view, Keypoints) else None,
     )
 
 

@@ -70,9 +70,9 @@ def corrected(
     return found.roi_px if drift <= max_drift and growth <= np.log(max_growth) else roi
 
 
-def first_pass_rows(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.ndarray:
-    """Select those of the frames `rows` (K,) in which a first pass corrects the crop: one in each `interval_s`, and the
-    first and last of each run of frames without a longer gap. 0: all."""
+def sampled_rows(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.ndarray:
+    """Select of the frames `rows` (K,) one in each `interval_s`, and the first and last of each run of frames without a
+    longer gap. 0: all."""
     if interval_s <= 0 or len(rows) < 2:
         return rows
     time = time_s[rows]
@@ -105,7 +105,7 @@ class Regions:
     def __init__(self, track_px: np.ndarray, time_s: np.ndarray, params: KeypointParams) -> None:
         self.track_px, self._time_s, self._params = rounded(track_px, params.crop_step_px), time_s, params
         self.rows = np.flatnonzero(np.isfinite(track_px).all(axis=1))
-        first = first_pass_rows(self.rows, time_s, params.first_look_s) if params.passes > 1 else self.rows[:0]
+        first = sampled_rows(self.rows, time_s, params.first_look_s) if params.passes > 1 else self.rows[:0]
         self.first = frozenset(first.tolist())
         self.reach_s = REACH_SD * params.smooth_s if params.passes > 1 else 0.0
         self._corrected_s = time_s[first]

@@ -8,6 +8,7 @@ drift to another person: if the first pass contradicts the track, the track is u
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
-from .crops import Regions, smooth_rois
+from .crops import Regions, sampled_rows, smooth_rois
 from .flips import exchange_sides, exchanged, lowered
 from .methods import METHODS
 from .passes import BatchDetector, BatchedInference, ParallelInference, two_passes
@@ -43,7 +44,8 @@ def detect_keypoints(
     params: Method[KeypointParams] | Paramset | KeypointParams | str | None = None,
     detector: KeypointDetector | None = None,
 ) -> Keypoints:
-    """Keypoints of person `person_id` in every frame; NaN with confidence 0 where she or the point is not in view.
+    """Keypoints of person `person_id` in every frame that the method uses (`KeypointParams.interval_s`); NaN with
+    confidence 0 where she or the point is not in view.
 
     `params` as for `METHODS.find`; `detector` replaces the method's. The video is decoded once, and frames of about
     half a second are in memory.
@@ -79,8 +81,11 @@ def detect_keypoints(
     detectors = [detector] if detector is not None else _detectors(method)
     roi = smooth_rois(_rois(track.roi_px, track.box_px), tracking.time_s, params.smooth_s)
     meter = PictureMeter()
-    found = _detect_all(detectors, video_path, roi, tracking.time_s, camera, params, meter)
-    return _assemble(found, detectors[0], tracking, camera, params, meter.result())
+    used = sampled_rows(np.arange(len(roi)), tracking.time_s, params.interval_s)
+    found = _detect_all(detectors, video_path, roi, used, tracking.time_s, camera, params, meter)
+    time_s, size_px = tracking.time_s[used], tracking.image_size_px
+    keypoints = _assemble(found, detectors[0], time_s, size_px, camera, params, meter.result())
+    return keypoints if len(used) == len(roi) else dataclasses.replace(keypoints, frame=used)
 
 
 def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -105,19 +110,22 @@ def _detect_all(
     detectors: list[KeypointDetector],
     video_path: str | Path,
     roi: np.ndarray,
+    used: np.ndarray,
     time_s: np.ndarray,
     camera: Camera,
     params: KeypointParams,
     meter: PictureMeter,
 ) -> list[PersonKeypoints | None]:
-    """Detections in each frame of the person whose region is `roi` (T, 4), NaN where she is not in view."""
-    regions = Regions(roi, time_s, params)
+    """Detections in each of the frames `used` (K,) of the person whose region is `roi` (T, 4), NaN where she is not in
+    view."""
+    mirrored = np.zeros(len(roi), bool)
+    mirrored[used[1::2]] = True
+    regions = Regions(np.where(np.isin(np.arange(len(roi)), used)[:, None], roi, np.nan), time_s, params)
     found: list[PersonKeypoints | None] = [None] * len(roi)
     frames = meter.watch(_in_view(video_path, regions.rows), roi)
     one = detectors[0]
     batched = isinstance(one, BatchDetector)
     sharing = one if isinstance(one, MirrorDetector) and _close(time_s[regions.rows], params.share_looks_s) else None
-    mirrored = np.arange(len(roi)) % 2 == 1
 
     def inspection(row: int) -> Inspection:
         return Inspection.FULL if sharing is None else Inspection.MIRRORED if mirrored[row] else Inspection.PLAIN
@@ -135,7 +143,10 @@ def _detect_all(
             next_step="track the people again in this file",
             key=str(video_path),
         )
-    return sharing.mirrored_inference.shared(found, mirrored, time_s, params.min_presence) if sharing else found
+    found = [found[i] for i in used]
+    if sharing is None:
+        return found
+    return sharing.mirrored_inference.shared(found, mirrored[used], time_s[used], params.min_presence)
 
 
 def _close(time_s: np.ndarray, most_s: float) -> bool:
@@ -153,7 +164,8 @@ def _in_view(video_path: str | Path, rows: np.ndarray) -> Iterator[Frame]:
 def _assemble(
     found: list[PersonKeypoints | None],
     detector: KeypointDetector,
-    tracking: Tracking,
+    time_s: np.ndarray,
+    size_px: tuple[int, int],
     camera: Camera,
     params: KeypointParams,
     picture: Picture,
@@ -161,7 +173,7 @@ def _assemble(
     n, j = len(found), len(detector.names)
     xy, xyz = np.full((n, j, 2), np.nan), np.full((n, j, 3), np.nan)
     confidence, box, crop = np.zeros((n, j)), np.full((n, 4), np.nan), np.full(n, np.nan)
-    width, height = tracking.image_size_px
+    width, height = size_px
     for row, person in enumerate(found):
         if person is None or person.presence < params.min_presence:
             continue
@@ -175,19 +187,19 @@ def _assemble(
         box[row] = np.clip(np.concatenate([low - margin, high + margin]), 0.0, [width, height, width, height])
     changed = None
     if params.sides is not None:
-        exchange = exchange_sides(tracking.time_s, detector.names, xy, xyz, confidence, params.sides)
+        exchange = exchange_sides(time_s, detector.names, xy, xyz, confidence, params.sides)
         xy, xyz = (exchanged(values, exchange, detector.names) for values in (xy, xyz))
         confidence = lowered(confidence, exchange, detector.names, params.sides)
         changed = exchange.table
     return Keypoints(
-        time_s=tracking.time_s,
+        time_s=time_s,
         names=detector.names,
         marker_set=detector.marker_set,
         xy_px=xy.astype(np.float32),
         xyz_cam_m=xyz.astype(np.float32),
         root_relative=detector.root_relative,
         confidence=confidence.astype(np.float32),
-        image_size_px=tracking.image_size_px,
+        image_size_px=size_px,
         camera=camera,
         box_px=box.astype(np.float32),
         origin=getattr(detector, "origin", ""),

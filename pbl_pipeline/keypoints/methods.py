@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from pbl_pipeline import models
 from pbl_pipeline.methods import Stage
 
@@ -27,16 +29,15 @@ METHODS.register(
     "blazepose-33", 4, KeypointParams(confidence_curve="blazepose-v2", crop_step_px=0.25, window_cells=1.5), blazepose
 )
 #: Shares inferences at 24 frames/s and more: each is slow, and those of two neighbouring frames differ little.
-METHODS.register(
-    "blazepose-heavy",
-    5,
-    KeypointParams(
-        model_sha256=HEAVY_SHA256,
-        share_looks_s=0.042,
-        confidence_curve="blazepose-heavy-v4",
-        lighter_first=True,
-        crop_step_px=0.25,
-        window_cells=1.5,
-    ),
+_HEAVY = KeypointParams(
+    model_sha256=HEAVY_SHA256,
+    share_looks_s=0.042,
+    confidence_curve="blazepose-heavy-v4",
+    lighter_first=True,
+    crop_step_px=0.25,
+    window_cells=1.5,
 )
+METHODS.register("blazepose-heavy", 5, _HEAVY)
+#: A recording at 60 frames/s as if it was filmed at 30.
+METHODS.register("blazepose-heavy-30hz", 1, dataclasses.replace(_HEAVY, interval_s=1 / 30))
 METHODS.register_family("onnx", ModelKeypointParams, onnx)

@@ -52,6 +52,8 @@ class KeypointParams:
     # Standard deviation, in cells, of the window in which a point is refined by its heat map (`heat_maps.refined`); 0:
     # the points as regressed.
     window_cells: float = later(0.0)
+    # Interval of the frames that are used, by their time stamps: keypoints and fit have no others; 0: all are used.
+    interval_s: float = later(0.0)
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""

@@ -26,7 +26,7 @@ _NEEDED = (
 _ASSUMED = ("distortion", "camera_source", "box_px")
 _OPTIONAL = (
     *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s"),
-    *("confidence_curve", "origin", "picture_time_s", "picture_luma", "picture_detail", "crop_px"),
+    *("confidence_curve", "origin", "picture_time_s", "picture_luma", "picture_detail", "crop_px", "frame"),
 )
 _NO_SOURCE = "not stated in the keypoints file"
 _FORMAT = "see docs/files.md, section keypoints.npz"
@@ -77,6 +77,7 @@ class Keypoints:
     sides_changed: np.ndarray | None = None
     #: (T,) longer side of the crop, in pixels of the picture, NaN where nothing was seen; None if not stated.
     crop_px: np.ndarray | None = None
+    frame: np.ndarray | None = None  # (T,) number of each frame in the video, from 0; None: all of it in order
     assumed: tuple[str, ...] = ()  # fields that the file did not have, and that have a default (`load`)
 
     def __post_init__(self) -> None:
@@ -94,6 +95,8 @@ class Keypoints:
             shapes["sides_changed"] = (self.sides_changed, (n, 3))
         if self.crop_px is not None:
             shapes["crop_px"] = (self.crop_px, (n,))
+        if self.frame is not None:
+            shapes["frame"] = (self.frame, (n,))
         for name, (array, shape) in shapes.items():
             if np.shape(array) != shape:
                 raise _format_error(f"{name} has shape {np.shape(array)}", f"shape {shape} for {n} frames, {j} names")
@@ -103,6 +106,8 @@ class Keypoints:
             raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
         if self.crop_px is not None and np.any(np.asarray(self.crop_px) <= 0):
             raise _format_error("a crop of size 0 or below", "crop_px above 0, or NaN where it is not stated")
+        if self.frame is not None and not np.all(np.diff(self.frame, prepend=-1) > 0):
+            raise _format_error("frame numbers that do not increase from 0 on", "the number of each frame in the video")
         check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)
         self._check_phone()
 
@@ -150,6 +155,7 @@ class Keypoints:
             "origin": self.origin or None,
             "sides_changed": None if self.sides_changed is None else np.asarray(self.sides_changed, bool),
             "crop_px": None if self.crop_px is None else np.asarray(self.crop_px, np.float32),
+            "frame": self.frame,
             **(self.picture.arrays() if self.picture is not None else {}),
         }
         np.savez(  # not packed, see `TrialFit.save`
@@ -184,7 +190,7 @@ class Keypoints:
         arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j)}
         arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "root_relative": ()}
         optional = {"distortion": (5,), "box_px": (n, 4), "focal_rel_sd": (), "phone_clock_sd_s": ()}
-        optional |= {"sides_changed": (n, 3), "crop_px": (n,)}
+        optional |= {"sides_changed": (n, 3), "crop_px": (n,), "frame": (n,)}
         check_numbers(path, data, arrays | {k: shape for k, shape in optional.items() if k in data})
         rel_sd = float(data.get("focal_rel_sd", np.nan))
         distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
@@ -211,6 +217,7 @@ class Keypoints:
             origin=text_of(path, data, "origin") if "origin" in data else "",
             sides_changed=data["sides_changed"].astype(bool) if "sides_changed" in data else None,
             crop_px=data.get("crop_px"),
+            frame=data.get("frame"),
         )
 
 

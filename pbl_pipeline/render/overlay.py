@@ -18,7 +18,7 @@ from pbl_pipeline.files import complete_file
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render.drawing import Strip, capsule_outline, draw_body, draw_keypoints, to_camera
-from pbl_pipeline.video import read_frames, scaled_matrix, write_h264
+from pbl_pipeline.video import Frame, read_frames, scaled_matrix, write_h264
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait import GaitEvent
@@ -109,9 +109,9 @@ def render_overlay(
 ) -> Path:
     """Write the recording with the fitted body over it as H.264 in MP4, and return its path.
 
-    Every frame of the video is in the output at its own time stamp (variable frame rate is kept); frames without a fit
-    show the bare picture. A strip below the picture shows the knee flexion of both sides, the foot contacts and the
-    time. Memory does not grow with the length of the video.
+    Every frame of the video that the fit has is in the output at its own time stamp (variable frame rate is kept); one
+    without a pose shows the bare picture. A strip below the picture shows the knee flexion of both sides, the foot
+    contacts and the time. Memory does not grow with the length of the video.
 
     Raises `PblError` VIDEO_* if the video cannot be read; VIDEO_CHANGED if its frames are not those of the fit;
     FILE_FORMAT if the keypoints are of another video.
@@ -137,13 +137,12 @@ def render_overlay(
 
     def pictures() -> Iterator[tuple[float, np.ndarray]]:
         nonlocal count
-        frames = read_frames(video_path)
-        for frame in progress.track(frames, f"overlay {fit.name}", total=len(fit.time_s)):
-            _check_frame(frame.image, frame.index, fit, video_path)
+        frames = _frames(video_path, fit)
+        for row, frame in progress.track(frames, f"overlay {fit.name}", total=len(fit.time_s)):
             picture = np.empty((height + strip_height, width, 3), np.uint8)
             same = frame.image.shape[:2] == (height, width)
             picture[:height] = frame.image if same else _resized(frame.image, (width, height))
-            painter.paint(picture[:height], frame.index)
+            painter.paint(picture[:height], row)
             picture[height:] = strip.frame(frame.time_s)
             count += 1
             yield frame.time_s, picture
@@ -201,10 +200,9 @@ def _images(video_path: str | Path | None, fit: TrialFit, indices: Sequence[int]
     if video_path is None:
         yield from ((i, np.full((*reversed(fit.image_size_px), 3), 255, np.uint8)) for i in indices)
     elif indices:
-        for frame in read_frames(video_path, stop=indices[-1] + 1):
-            if frame.index in indices:
-                _check_frame(frame.image, frame.index, fit, video_path)
-                yield frame.index, frame.image.copy()
+        for row, frame in _frames(video_path, fit, indices[-1]):
+            if row in indices:
+                yield row, frame.image.copy()
 
 
 def report_indices(fit: TrialFit) -> list[int]:
@@ -249,9 +247,16 @@ def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
     return image[y0 : y0 + round(h), x0 : x0 + round(w)]
 
 
-def _check_frame(image: np.ndarray, index: int, fit: TrialFit, video_path: str | Path) -> None:
-    size = (image.shape[1], image.shape[0])
-    if size != tuple(fit.image_size_px):
-        raise _changed(f"a frame of {size} px", f"{tuple(fit.image_size_px)} px, as when it was fitted", key=video_path)
-    if index >= len(fit.time_s):
-        raise _changed(f"a frame {index}", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
+def _frames(video_path: str | Path, fit: TrialFit, last: int | None = None) -> Iterator[tuple[int, Frame]]:
+    """Rows of the fit, until row `last`, and their frames. Raises `PblError` VIDEO_CHANGED."""
+    number = np.arange(len(fit.time_s)) if fit.frame is None else fit.frame
+    for frame in read_frames(video_path, stop=None if last is None else int(number[last]) + 1):
+        size, was = (frame.image.shape[1], frame.image.shape[0]), tuple(fit.image_size_px)
+        if size != was:
+            raise _changed(f"a frame of {size} px", f"{was} px, as when it was fitted", key=video_path)
+        if frame.index > number[-1]:
+            expected = f"{int(number[-1]) + 1} frames, as when it was fitted"
+            raise _changed(f"a frame {frame.index}", expected, key=video_path)
+        row = int(np.searchsorted(number, frame.index))
+        if number[row] == frame.index:
+            yield row, frame

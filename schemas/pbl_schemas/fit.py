@@ -366,6 +366,8 @@ def fit_checks(key: Mapping[str, Any]) -> list[Quality]:
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:
-    """Return the trial with float32 arrays except for time stamps, for the store."""
-    wide = [f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)]
-    return dataclasses.replace(trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide if n != "time_s"})
+    """Return the trial with float32 arrays except for stamps and numbers of frames, for the store."""
+    wide = {f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)}
+    return dataclasses.replace(
+        trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide - {"time_s", "frame"}}
+    )

@@ -80,7 +80,7 @@ def check_fields(path: Path, title: str, sizes: dict[str, int], optional: tuple[
 def test_keypoints_are_as_described(here):
     detected = here / "walking.keypoints.npz"
     sizes = {"T": 90, "J": 33}
-    optional = ("phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s", "xyz_world_m", "origin")
+    optional = ("phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s", "xyz_world_m", "origin", "frame")
     undocumented = check_fields(detected, "<name>.keypoints.npz", sizes, optional)
     assert undocumented <= {"root_relative"}  # named in the row of xyz_cam_m
     with np.load(detected) as f:
@@ -97,7 +97,7 @@ def test_keypoints_are_as_described(here):
 
 
 def test_the_fit_is_as_described(fitted):
-    assert not check_fields(fitted, "<name>.fit.npz", {"T": 90, "J": 33, "40": 40}, ("sensors", "depth"))
+    assert not check_fields(fitted, "<name>.fit.npz", {"T": 90, "J": 33, "40": 40}, ("sensors", "depth", "frame"))
     with np.load(fitted) as f:
         assert tuple(f["joint_names"].tolist()) == load_body().joint_names
         assert str(f["body_sha256"]) == load_body().sha256

@@ -397,6 +397,18 @@ def test_keypoints_take_the_camera_and_the_depths_of_a_recording(tmp_path: Path)
         with_recordings([SimpleNamespace(markers="of a laboratory")], [DepthFile(folder, 0.001)])
 
 
+def test_each_frame_has_its_own_picture_where_keypoints_leave_frames_out(tmp_path: Path):
+    made = synthesise(SynthSpec(seconds=1.0, marker_set="blazepose_33", seed=512)).keypoints
+    n = len(made.time_s)
+    folder = write(tmp_path / "a", lambda i: np.full((160, 90), 3000 + i, np.uint16), n)
+    used = np.append(np.arange(0, n - 1, 2), n - 1)
+    arrays = {f.name: getattr(made, f.name) for f in dataclasses.fields(made)}
+    per_frame = {k: v[used] for k, v in arrays.items() if isinstance(v, np.ndarray) and v.shape[:1] == (n,)}
+    _, (depth,) = with_recordings([dataclasses.replace(made, **per_frame, frame=used)], [DepthFile(folder, 0.001)])
+    assert depth is not None
+    np.testing.assert_allclose(np.nanmedian(depth.m, axis=(1, 2)), 3.0 + 0.001 * used, atol=1e-6)
+
+
 def test_recordings_are_named_with_their_own_scale():
     files = ["none", "0.001=a", "0.00025=b/c", "x=d", "nan=e"]
     paths = (

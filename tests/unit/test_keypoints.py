@@ -1,11 +1,14 @@
 """Crops, the virtual camera of a crop, and the two-pass run, against synthetic geometry."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.keypoints import (
+    KeypointDetector,
     KeypointParams,
     Keypoints,
     PersonKeypoints,
@@ -16,8 +19,9 @@ from pbl_pipeline.keypoints import (
     view_rotation,
 )
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES
-from pbl_pipeline.keypoints.crops import Regions, corrected, first_pass_rows, smooth_at, smooth_rois
+from pbl_pipeline.keypoints.crops import Regions, corrected, sampled_rows, smooth_at, smooth_rois
 from pbl_pipeline.keypoints.detect import _detect_all
+from pbl_pipeline.keypoints.mirrored_inference import MirroredInference
 from pbl_pipeline.keypoints.virtual_camera import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
@@ -140,14 +144,27 @@ def test_crops_do_not_depend_on_rounding_elsewhere() -> None:
     assert np.abs(regions[2] - track)[:, :3].max() <= 0.125
 
 
-def test_first_pass_rows_are_spread_evenly_and_begin_and_end_each_run():
+def test_sampled_rows_are_spread_evenly_and_begin_and_end_each_run():
     time = np.arange(60) / 30
     rows = np.concatenate([np.arange(0, 20), np.arange(31, 60)])
     np.testing.assert_array_equal(
-        first_pass_rows(rows, time, 0.1), [0, 3, 6, 9, 12, 15, 18, 19, 31, 34, 37, 40, 43, 46, 49, 52, 55, 58, 59]
+        sampled_rows(rows, time, 0.1), [0, 3, 6, 9, 12, 15, 18, 19, 31, 34, 37, 40, 43, 46, 49, 52, 55, 58, 59]
     )
-    np.testing.assert_array_equal(first_pass_rows(rows, time, 0.0), rows)
-    np.testing.assert_array_equal(first_pass_rows(rows[:1], time, 0.1), rows[:1])
+    np.testing.assert_array_equal(sampled_rows(rows, time, 0.0), rows)
+    np.testing.assert_array_equal(sampled_rows(rows[:1], time, 0.1), rows[:1])
+
+
+@pytest.mark.parametrize(("rate_hz", "every"), [(24.0, 1), (30.0, 1), (60.0, 2), (120.0, 4), (240.0, 8)])
+def test_frames_are_left_out_by_their_stamps(rate_hz: float, every: int) -> None:
+    """At 30 Hz, also where a phone's stamps jitter by a fifth of a frame, and where it loses some frames."""
+    rng, n = np.random.default_rng(0), 8 * every * 12 + 1
+    for jitter in (0.0, 0.2):
+        time = (np.arange(n) + rng.uniform(-jitter, jitter, n) * (np.arange(n) % every > 0)) / rate_hz
+        np.testing.assert_array_equal(sampled_rows(np.arange(n), time, 1 / 30), np.arange(0, n, every))
+        kept = np.delete(time, slice(20, 20 + every * 3))
+        used = kept[sampled_rows(np.arange(len(kept)), kept, 1 / 30)]
+        assert np.diff(used).max() <= np.diff(kept).max() + 1 / 30
+        assert {kept[19], kept[20]} <= set(used)  # a gap is as long as it was
 
 
 def test_the_track_wins_where_the_first_pass_contradicts_it():
@@ -223,6 +240,60 @@ def test_two_passes_and_missing_values(case, tmp_path):
     assert again.names == ("middle", "left", "right")
 
 
+def test_a_method_leaves_frames_out(case, tmp_path):
+    """Keypoints and their checks are those of a recording with the used frames alone."""
+    video, tracking = case
+    detector, params = Cross(), KeypointParams(passes=1, interval_s=1 / 15, sides=None)
+    keypoints = detect_keypoints(video, tracking, 1, SMALL, params, detector)
+    number = [*range(0, 90, 2), 89]
+    assert keypoints.frame is not None
+    assert keypoints.frame.tolist() == number
+    assert len(detector.calls) == len([i for i in number if 10 <= i < 70 and not 30 <= i < 35])
+    every = detect_keypoints(video, tracking, 1, SMALL, KeypointParams(passes=1, sides=None), Cross())
+    assert every.frame is None
+    for name in ("time_s", "xy_px", "xyz_cam_m", "confidence", "box_px"):
+        np.testing.assert_array_equal(getattr(keypoints, name), getattr(every, name)[number])
+    rate = {c.check: c.value for c in check_keypoints(keypoints)}
+    assert rate["frame_rate_hz"] == pytest.approx(15, rel=0.05)
+    keypoints.save(tmp_path / "k.npz")
+    again = Keypoints.load(tmp_path / "k.npz")
+    assert again.frame is not None
+    assert again.frame.tolist() == number
+    for wrong in ([*number[:-1], number[-2]], [-1, *number[1:]]):
+        refused("FILE_FORMAT", dataclasses.replace, keypoints, frame=np.array(wrong))
+    refused("FILE_FORMAT", dataclasses.replace, keypoints, frame=np.arange(3))
+
+
+def test_of_the_used_frames_every_second_is_mirrored(case):
+    video, tracking = case
+    shared: list[np.ndarray] = []
+
+    class Records(MirroredInference):
+        def shared(self, found, mirrored, time_s, min_presence):
+            assert len(found) == len(mirrored) == len(time_s)
+            shared.append(mirrored)
+            return list(found)
+
+    class Mirrors(Cross):
+        mirrored_inference = Records(Cross.names, 100.0, 20.0)
+
+        def crop_of(self, roi_px):
+            return np.eye(2, 3), (8, 8)
+
+        def detect_crop(self, crop, roi_px, camera, *, quick=False):
+            return self.detect(crop, roi_px, camera, quick=quick)
+
+        def detect_once(self, crop, roi_px, camera, *, mirrored=False):
+            return self.detect(crop, roi_px, camera)
+
+    for interval_s, n in ((0.0, 90), (1 / 15, 46)):
+        params = KeypointParams(passes=1, interval_s=interval_s, share_looks_s=0.07, sides=None)
+        keypoints = detect_keypoints(video, tracking, 1, SMALL, params, Mirrors())
+        assert len(keypoints.time_s) == n
+        np.testing.assert_array_equal(shared.pop(), np.arange(n) % 2 == 1)
+        assert not shared
+
+
 def test_one_reading_sees_what_two_readings_of_the_video_see(case):
     """The plain way: the whole first pass, all crops, the whole second pass. Detectors in threads change nothing."""
     video, tracking = case
@@ -232,13 +303,14 @@ def test_one_reading_sees_what_two_readings_of_the_video_see(case):
     rows = np.flatnonzero(np.isfinite(roi[:, 0]))
     better = np.full_like(roi, np.nan)
     limits = params.min_presence, params.max_drift, params.max_growth
-    for row in first_pass_rows(rows, time, params.first_look_s):
+    for row in sampled_rows(rows, time, params.first_look_s):
         better[row] = corrected(roi[row], Cross().detect(images[row], roi[row], CAMERA), *limits)
     known = np.flatnonzero(np.isfinite(better[:, 0]))
     plain = {row: smooth_at(better[known], time[known], time[row], params.smooth_s) for row in rows}
 
     for n_detectors in (1, 3):
-        found = _detect_all([Cross() for _ in range(n_detectors)], video, roi, time, CAMERA, params, PictureMeter())
+        detectors: list[KeypointDetector] = [Cross() for _ in range(n_detectors)]
+        found = _detect_all(detectors, video, roi, np.arange(len(roi)), time, CAMERA, params, PictureMeter())
         assert [row for row, person in enumerate(found) if person is not None] == rows.tolist()
         for row in rows:
             person = found[row]

@@ -27,6 +27,7 @@ SHIPPED = {
     ("subject", "walker", 2): "4a27a14ec961fed1",
     ("keypoints", "blazepose-33", 4): "4f2e29a511b43439",
     ("keypoints", "blazepose-heavy", 5): "d27f08d9dd31a380",
+    ("keypoints", "blazepose-heavy-30hz", 1): "fb5da96936eacce9",
     ("fit", "paper-2025", 2): "177d1e2810a04248",
     ("fit", "paper-gauss-newton", 3): "bcd62f28a515f283",
     ("fit", "gauss-newton", 5): "45eee8dd5c125990",

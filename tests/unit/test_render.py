@@ -10,7 +10,7 @@ import pytest
 
 from pbl_pipeline.body import capsules, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import fit_session
+from pbl_pipeline.fit import TrialFit, fit_session
 from pbl_pipeline.gait import GaitEvent, angle_series
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render import (
@@ -386,6 +386,32 @@ def test_files_of_another_video_are_refused(walk, clip, tmp_path: Path) -> None:
     with pytest.raises(PblError, match=r"^VIDEO_MISSING: "):
         render_overlay(tmp_path / "absent.mp4", walk, out)
     assert list(tmp_path.iterdir()) == []  # no half file is left
+
+
+def test_an_overlay_has_the_frames_that_the_fit_has(walk, clip, tmp_path: Path) -> None:
+    """A keypoint method may leave frames out: each pose is drawn into its own frame, the others are not shown."""
+    path, time = clip
+    number = np.array([*range(0, N, 2), N - 1])
+
+    def of(number: np.ndarray, shown: np.ndarray) -> TrialFit:
+        names = ("qpos", "qpos_sd", "markers_world_m", "phone_quat_wxyz", "residual_2d_px", "residual_3d_m")
+        rows = {n: getattr(walk, n)[number[: len(shown)]] for n in names}
+        return dataclasses.replace(walk, **rows, time_s=time[number[: len(shown)]], frame=shown)
+
+    fit = of(number, number)
+    shown = read_frames(render_overlay(path, fit, tmp_path / "o.mp4"))
+    np.testing.assert_allclose([f.time_s for f in shown], time[number], atol=1e-4)
+    (here,), (there,) = overlay_frames(path, fit, [5]), overlay_frames(path, walk, [10])
+    np.testing.assert_array_equal(here, there)
+    for other in (number[:-1], np.append(number[:-1], N)):
+        with pytest.raises(PblError, match=r"^VIDEO_CHANGED: "):
+            render_overlay(path, of(number, other), tmp_path / "p.mp4")
+    fit.save(tmp_path / "walk.fit.npz")
+    again = TrialFit.load(tmp_path / "walk.fit.npz").frame
+    assert again is not None
+    assert again.tolist() == number.tolist()
+    walk.save(tmp_path / "all.fit.npz")
+    assert TrialFit.load(tmp_path / "all.fit.npz").frame is None
 
 
 def test_sides_differ_for_every_colour_vision() -> None:
