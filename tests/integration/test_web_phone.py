@@ -890,7 +890,7 @@ def test_logs_of_wearable_sensors_are_one_set(visit: int, tmp_path: Path):
 def test_a_form_of_logs_is_bounded_and_is_of_a_link_that_lasts(
     visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Whatever length the request states; a link that ended while it came attaches nothing."""
+    """Its bytes are counted as they come; a link that ended meanwhile attaches nothing."""
     browser, sent = phone(visit), [("worn", (f"{i}.csv", b"x" * 60_000)) for i in range(2)]
     with monkeypatch.context() as patch:
         patch.setattr(registration, "LARGEST_LOG", 100_000)

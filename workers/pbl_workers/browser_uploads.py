@@ -149,7 +149,7 @@ def register(
 ) -> list[Received] | None:
     """Register files that were checked; a sensor log goes with the video of its name, those of wearable sensors
     with the visit, all together. One outcome for each video, each log without a video, and all wearable sensors; None,
-    with nothing done, while the drop folder is being taken over or a person removed, unless they come alone.
+    with nothing done, while the drop folder is being taken over or a person removed (not for logs alone).
 
     Raises `PblError` DB_NOT_FOUND if the visit is gone, PHONE_LINK if the link is, DB_..., STORE_..., FILE_UNWRITABLE.
     """
