@@ -303,7 +303,7 @@ def test_bad_input_is_named(tmp_path: Path, what: str, found: str, says: str):
 
 def test_a_log_of_two_samples_is_no_failure_of_the_program(tmp_path: Path):
     """Also where both are at the end of the range, which three samples in a row show."""
-    table = Swing().own()[:2]
+    table = Swing().own().head(2)
     table[GYR] = 500.0
     log = Swing().write(tmp_path / "two.csv", table)
     assert "angular rates of up to" in str(refused(f"shank_r={log}").found)
