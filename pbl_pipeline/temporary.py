@@ -47,6 +47,11 @@ def new_folder(beside: Path | None = None) -> TemporaryFolder:
     return TemporaryFolder(dir=beside, prefix=f"{hidden}{_PREFIX}{os.getpid()}-{_OWN}-")
 
 
+def free_bytes() -> int:
+    """Return the bytes that are free in the system's folder for temporary files."""
+    return shutil.disk_usage(tempfile.gettempdir()).free
+
+
 def private_folder(name: str) -> Path:
     """Return the folder `name` of this user among the temporary files, which no other user may enter. It stays.
 

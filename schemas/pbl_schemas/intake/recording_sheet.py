@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import datetime
 import functools
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline import temporary
 from pbl_pipeline.depth import DepthFile
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import normalised_label, whole_number
@@ -84,7 +83,7 @@ def _ingest(sheet: Path, methods: Methods | None, dry_run: bool, copies: context
             one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
             one.read()
             copies.callback(one.sensors.remove_copies)
-            if dry_run or shutil.disk_usage(tempfile.gettempdir()).free < _KEPT_FREE:
+            if dry_run or temporary.free_bytes() < _KEPT_FREE:
                 one.sensors.remove_copies()  # those of all rows need not fit on the disk
             sha256, file = one.files[0].sha256, row.cells["file"]
             if (first := seen.setdefault(sha256, row.where)) != row.where:
