@@ -38,14 +38,13 @@ def register(*paths: Path, **visit) -> list[int]:
 @contextmanager
 def one_query_at_a_time() -> Iterator[None]:
     """The test's thread and one of the program share DataJoint's connection, as no two threads do outside tests."""
-    connected, waiting = connection.dj.conn(), threading.RLock()
-    execute = connected._execute_query
+    execute = connection.dj.Connection._execute_query
 
-    def alone(*args: Any) -> None:
-        with waiting:
-            execute(*args)
+    def alone(connected: Any, *args: Any) -> None:
+        with vars(connected).setdefault("_waiting", threading.RLock()):
+            execute(connected, *args)
 
-    with mock.patch.object(connected, "_execute_query", alone):
+    with mock.patch.object(connection.dj.Connection, "_execute_query", alone):
         yield
 
 
