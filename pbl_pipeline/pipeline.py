@@ -280,5 +280,6 @@ def _pictures(recording: Recording, fit: TrialFit) -> tuple[Picture, ...]:
         return ()
     index = report_indices(fit)
     images = overlay_frames(video, fit, index, crop_to_body=True, max_side_px=760)
-    number = np.arange(len(fit.time_s)) if fit.frame is None else fit.frame
-    return tuple(Picture(int(number[i]), float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True))
+    return tuple(
+        Picture(int(fit.frame_numbers[i]), float(fit.time_s[i]), image) for i, image in zip(index, images, strict=True)
+    )

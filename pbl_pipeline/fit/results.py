@@ -73,6 +73,11 @@ class TrialFit:
     frame: np.ndarray | None = None
 
     @property
+    def frame_numbers(self) -> np.ndarray:
+        """Number (T,) of each frame in the video."""
+        return np.arange(len(self.time_s)) if self.frame is None else self.frame
+
+    @property
     def sized(self) -> bool:
         """True if the person's stated height or depth recordings set the scale of one camera."""
         return bool(np.isfinite(self.height_m)) or self.with_depths

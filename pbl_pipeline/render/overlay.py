@@ -249,7 +249,7 @@ def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
 
 def _frames(video_path: str | Path, fit: TrialFit, last: int | None = None) -> Iterator[tuple[int, Frame]]:
     """Rows of the fit, until row `last`, and their frames. Raises `PblError` VIDEO_CHANGED."""
-    number = np.arange(len(fit.time_s)) if fit.frame is None else fit.frame
+    number = fit.frame_numbers
     for frame in read_frames(video_path, stop=None if last is None else int(number[last]) + 1):
         size, was = (frame.image.shape[1], frame.image.shape[0]), tuple(fit.image_size_px)
         if size != was:
