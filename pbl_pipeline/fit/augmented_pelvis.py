@@ -23,8 +23,8 @@ from .session import Session
 
 #: Markers of `opencap_35` on the pelvis.
 SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
-#: A trial with both knees bent by more than this (rad) at once, in more than this share of the frames, is not a walk,
-#: not even in a crouch.
+#: A trial with both knees bent by more than this (rad) at once, in more than this share of the frames, is taken for one
+#: with sitting or squatting. So is a walk in a deep crouch (13 % of the frames of one child with cerebral palsy).
 FOLDED_RAD, FOLDED_SHARE = np.deg2rad(60.0), 0.05
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtri
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
@@ -17,7 +16,7 @@ from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import LEFT, RIGHT
 from pbl_pipeline.results.index import GDI_MODEL, GILLETTE_MODEL, NUMBERS, PAPER_INDEX, Gdi, GdiCycle
-from pbl_pipeline.results.measures import Z90
+from pbl_pipeline.results.measures import Z90, minimal_change_of
 
 from .cycle_measures import far_leg_of
 from .measurement import (
@@ -431,13 +430,6 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
     walk = sum(p.weight**2 * p.chance for p in parts)
     anew = float(np.sqrt((1.0 - params.repeated) * fit + walk))
     return float(np.sqrt(fit + walk)), minimal_change_of(anew)
-
-
-def minimal_change_of(sd_anew: float) -> float:
-    """Return the minimal detectable change (90 %) between two visits, whose new errors have the standard deviation
-    `sd_anew` each."""
-    # As `stats.minimal_detectable_change`, which loads `scipy.stats` and pandas: every command would wait for them.
-    return float(-ndtri((1 - 0.9) / 2) * np.sqrt(2) * sd_anew)
 
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:

@@ -17,7 +17,7 @@ from pbl_pipeline.records import plain, record
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvents
 from pbl_pipeline.results.index import SessionMetrics
-from pbl_pipeline.results.measures import OF_VISIT, Z90
+from pbl_pipeline.results.measures import OF_VISIT, Z90, minimal_change_of
 
 from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
@@ -27,7 +27,6 @@ from ._gdi import (
     PAPER_INDEX,
     Gdi,
     GdiParams,
-    minimal_change_of,
     norm_of,
     params_of,
     score_gdi,

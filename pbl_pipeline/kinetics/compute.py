@@ -18,7 +18,8 @@ from pbl_pipeline.gait.cycle_measures import measure_of, sampling_sd
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
 from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, Check, in_order, warn_if
-from pbl_pipeline.results.forces import WIDTH_SD, CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
+from pbl_pipeline.results.forces import CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.texts import code_of
@@ -268,7 +269,7 @@ def _pool(
 
 def too_uncertain(name: str, sd: float) -> bool:
     """Return whether the 90 % interval of a measure is wider than the range of healthy people."""
-    return WIDTH_SD * sd > HEALTHY_RANGE * HEALTHY_SD[name]
+    return Z90 * sd > HEALTHY_RANGE * HEALTHY_SD[name]
 
 
 def _measure(

@@ -11,7 +11,7 @@ from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.kinetics import GRAVITY, KineticMeasure, Kinetics
 from pbl_pipeline.qc import PASS
 from pbl_pipeline.report.words import plural, sentence
-from pbl_pipeline.results.forces import WIDTH_SD
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 
@@ -35,7 +35,7 @@ def forces_section(visit: Visit) -> dict | None:
     if not kinetics.measures:
         return {"reason": sentence(f"No forces: {kinetics.reason}"), "open": False}
     peak = kinetics.measures.get("vertical_peak_loading_bw")
-    sure = peak is not None and peak.sd is not None and WIDTH_SD * peak.sd <= _UNSURE_BW
+    sure = peak is not None and peak.sd is not None and Z90 * peak.sd <= _UNSURE_BW
     weight = kinetics.mass_kg
     in_newtons = "" if weight is None else f" 1 BW is {number(GRAVITY * weight, 0)} N."
     residual = kinetics.residual_bw
@@ -60,7 +60,7 @@ def _row(name: str, measure: KineticMeasure | None, reason: str, mass_kg: float 
         both += f" ({number(low_high[0], decimals)} to {number(low_high[1], decimals)})"
     asymmetry = number(measure.asymmetry_percent, 0)
     if measure.asymmetry_sd is not None:
-        asymmetry += f" \N{PLUS-MINUS SIGN} {number(WIDTH_SD * measure.asymmetry_sd, 0)}"
+        asymmetry += f" \N{PLUS-MINUS SIGN} {number(Z90 * measure.asymmetry_sd, 0)}"
     newtons = "" if mass_kg is None or unit != "BW" else f"{number(GRAVITY * mass_kg * measure.mean, 0)} N"
     return {
         "name": title,

@@ -11,8 +11,7 @@ import numpy as np
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import column, plain, record
 
-#: Half of a 90 % interval in standard deviations.
-WIDTH_SD = 1.645
+from .measures import Z90
 
 
 @record
@@ -43,7 +42,7 @@ class KineticMeasure:
     @property
     def interval(self) -> tuple[float, float] | None:
         """90 % interval of the mean."""
-        return None if self.sd is None else (self.mean - WIDTH_SD * self.sd, self.mean + WIDTH_SD * self.sd)
+        return None if self.sd is None else (self.mean - Z90 * self.sd, self.mean + Z90 * self.sd)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the measure for JSON."""

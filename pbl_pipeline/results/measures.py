@@ -11,6 +11,16 @@ from pbl_pipeline.words import MEASURES
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
+
+
+def minimal_change_of(sd_anew: float, confidence: float = 0.9) -> float:
+    """Return z sqrt(2) sd: two values of one thing, whose new errors have the standard deviation `sd_anew` each, differ
+    by more in 1 - confidence of cases (minimal detectable change; Weir 2005, J Strength Cond Res 19:231)."""
+    from scipy.special import ndtri  # the tables import this module, and compute nothing
+
+    return float(-ndtri((1 - confidence) / 2) * math.sqrt(2) * sd_anew)
+
+
 #: Fields of `Measure` that those of a visit have, not those of a trial.
 OF_VISIT = ("error_sd", "minimal_change")
 #: Fields of `Spatiotemporal` that stand in the row of the cycles.

@@ -9,6 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy import optimize, stats
 
+from pbl_pipeline.results.measures import minimal_change_of
+
 from .types import Estimate, differ, fraction, labels, numbers, one_of, refuse
 
 
@@ -157,7 +159,7 @@ def minimal_detectable_change(sem: float, confidence: float = 0.95) -> float:
     """
     if not 0 <= sem < np.inf:
         raise refuse(f"SEM {sem}", "a number of at least 0", "compute it with icc")
-    return float(stats.norm.isf((1 - fraction(confidence, "confidence")) / 2) * np.sqrt(2) * sem)
+    return minimal_change_of(sem, fraction(confidence, "confidence"))
 
 
 def ratings_table(values: Any, subjects: Any, raters: Any = None) -> np.ndarray:

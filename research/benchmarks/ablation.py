@@ -31,11 +31,10 @@ from threadpoolctl import threadpool_limits
 from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit, fit_sessions
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.synthetic import pelvis_positions
 from research.benchmarks.ablation_cases import DEFAULT, WALKS, Factor, WalkSource, factors, paramset_of, session
 
-#: Standard deviations to either side of a 90 % interval of the normal distribution.
-WIDTH_SD = 1.645
 #: Walks on which nothing was tuned: the paramsets were tuned on 0 to 5 and their factors on 0 to 47 and 1000 to 1047.
 FIRST_SEED = 100
 FIGURES = ("all_deg", "main_deg", "bias_deg", "sd_deg", "bias_share", "rte_cm", "within_90")
@@ -62,7 +61,7 @@ def errors_of(fit: TrialFit, truth: np.ndarray) -> dict[str, Any]:
         "median_deg": np.median(np.abs(error), axis=0),
         "bias_deg": error.mean(axis=0),
         "sd_deg": error.std(axis=0),
-        "within_90": np.mean(np.abs(error) < WIDTH_SD * sd, axis=0),
+        "within_90": np.mean(np.abs(error) < Z90 * sd, axis=0),
     }
     out: dict[str, Any] = {k: dict(zip(PAPER_JOINTS, v.tolist(), strict=True)) for k, v in each.items()}
     out["rte_cm"] = 100 * path_error_m(pelvis_positions(fit.qpos[known]), pelvis_positions(truth[known]))

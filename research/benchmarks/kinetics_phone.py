@@ -43,7 +43,7 @@ from pbl_pipeline.gait.laboratory import read_lab_trial
 from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, visit_kinetics
 from pbl_pipeline.kinetics.compute import CYCLE_SD, HEALTHY_SD, MAX_ASYMMETRY_SD, METHOD_SD, too_uncertain, trial_series
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
-from pbl_pipeline.results.forces import WIDTH_SD
+from pbl_pipeline.results.measures import Z90
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
 from research.corpus.walks import Case, Walk, detector_model, recorded_walks, synthetic_walk
 from research.paths import SHARED
@@ -185,7 +185,7 @@ def main(kind: str, detector: str, tilt: float) -> None:
         for name in MEASURES:
             truth, error, sd, shown = np.array(rows[tuning, name]).T
             cells = (truth.mean(), error.mean(), np.sqrt(np.mean(error**2)), np.sqrt(np.mean(sd**2)))
-            found = (np.mean(np.abs(error) < WIDTH_SD * sd), shown.mean())[: len(shares)]
+            found = (np.mean(np.abs(error) < Z90 * sd), shown.mean())[: len(shares)]
             click.echo(f"{name:42}" + "".join(f"{c:9.3f}" for c in cells) + "".join(f"{s:7.0%}" for s in found))
         click.echo(f"\n{'asymmetry (percent)':42}{'rms':>9}{'sd':>9}{'held':>7}{'shown':>7}{'together':>10}{'side':>9}")
         for name in MEASURES:
@@ -194,7 +194,7 @@ def main(kind: str, detector: str, tilt: float) -> None:
                 continue
             off, sd = alike[np.isfinite(alike[:, 1]), :2].T
             cells = (np.sqrt(np.mean(off**2)), np.sqrt(np.mean(sd**2)))
-            found = (np.mean(np.abs(off) < WIDTH_SD * sd), np.mean(sd <= MAX_ASYMMETRY_SD))
+            found = (np.mean(np.abs(off) < Z90 * sd), np.mean(sd <= MAX_ASYMMETRY_SD))
             alone = [np.mean(v[:, 2] * v[:, 3]) / np.mean(v[:, 2:] ** 2) if len(v) else np.nan for v in (alike, unlike)]
             click.echo(
                 f"{name:42}" + "".join(f"{c:9.1f}" for c in cells) + "".join(f"{s:7.0%}" for s in found)

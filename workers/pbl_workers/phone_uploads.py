@@ -19,7 +19,7 @@ from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders, unfinished
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, busy, folder_of, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
@@ -131,8 +131,7 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     visit = VisitRecord(phone.subject, phone.label, **stated)
     with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            found = "recordings of the drop folder are being taken over"
-            raise PblError("DB_REFUSED", found, "one import at a time", "the page tries again")
+            raise busy("the page tries again")
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
         if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
             # Without the owner: the phone has the right to its own visit alone.

@@ -16,7 +16,7 @@ from pbl_pipeline.names import check_label, normalised_label
 
 from .. import fit, gait, gdi, keypoints, kinetics, lab, session, video, worker
 from ..datajoint_setup import dj
-from ..operations.archive import LOCK, archive_dir, folder_of, plain_name
+from ..operations.archive import LOCK, archive_dir, busy, folder_of, plain_name
 from ..operations.folders import private_folder, remove_empty, sync_folders
 from ..queues import forget_errors
 from ..rows import delete_below
@@ -135,7 +135,7 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
         return
     with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            raise _kept("uploads are being taken over now", next_step="repeat this in a minute", key=kept[0])
+            raise busy("repeat this in a minute", kept[0])
         names: dict[Path, Path] = {}
         try:
             folder = private_folder(folder_of(archive, "", plan.after[0]) / plain_name(plan.after[1]))

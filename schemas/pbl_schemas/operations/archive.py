@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pbl_pipeline import settings
+from pbl_pipeline.errors import PblError
 
 from .. import video
 from ..subject_codes import SUBJECT_CODE
@@ -39,6 +40,12 @@ _SEEN, _PLACED = "seen.json", ".placed"
 def archive_dir() -> Path:
     """Return the folder of the recordings: PBL_ARCHIVE (default: recordings/ in PBL_HOME)."""
     return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings").absolute()
+
+
+def busy(next_step: str, key: object = None) -> PblError:
+    """The error of who finds `LOCK` taken."""
+    found = "recordings of the drop folder are being taken over"
+    return PblError("DB_REFUSED", found=found, expected="one import at a time", next_step=next_step, key=key)
 
 
 def disks() -> list[tuple[str, float, float]]:

@@ -112,11 +112,11 @@ def force_frame(restriction: Any = True) -> pd.DataFrame:
     """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
     the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
     null if unknown, with the reason in `force_missing`."""
-    from pbl_pipeline.results.forces import WIDTH_SD
+    from pbl_pipeline.results.measures import Z90
 
     forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
     found = frame_of(current_sets() * forces * kinetics.Kinetics.Measure & restriction)
-    half = WIDTH_SD * found["force_sd"].astype(float)
+    half = Z90 * found["force_sd"].astype(float)
     found = found.assign(force_low=found["force_mean"] - half, force_high=found["force_mean"] + half)
     return found.sort_values(["session_id", "force_measure"], kind="stable", ignore_index=True)
 

@@ -21,6 +21,7 @@ from pbl_schemas import lab
 from pbl_schemas.fit import worn_logs
 from pbl_schemas.intake import Sensors
 from pbl_schemas.intake.uploads import LARGEST_LOG
+from pbl_schemas.operations.archive import busy
 from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
@@ -38,7 +39,6 @@ from .tables import on_disk
 _BLOCK, _WAIT_S = 2**20, 60.0
 _NEXT_STEP = "tell who runs the server"
 _on_disk = functools.partial(on_disk, _NEXT_STEP)
-_BUSY = "recordings of the drop folder are being taken over", "one import at a time", "send it again in some minutes"
 _NO_FILE = "no file", "at least one video", "choose a video, then send it"
 _NO_LOG = "no file", "logs of sensors", "choose the logs, all of them together"
 
@@ -156,7 +156,9 @@ async def taken_in(
             return done
         await asyncio.sleep(1.0)
     names = [one.name for one, _ in good] + [one.file.name for one in worn.imu]
-    return [Received(name, "refused", error=PblError("DB_REFUSED", *_BUSY, key=name)) for name in dict.fromkeys(names)]
+    return [
+        Received(name, "refused", error=busy("send it again in some minutes", name)) for name in dict.fromkeys(names)
+    ]
 
 
 ROUTES = [
