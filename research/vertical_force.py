@@ -28,7 +28,7 @@ from pbl_pipeline.body import load_body, stature_m
 from pbl_pipeline.kinetics import GRAVITY, contact_of, inverse_dynamics, smooth_motion
 from pbl_pipeline.kinetics import vertical as stage
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
-from pbl_pipeline.results.forces import WIDTH_SD
+from pbl_pipeline.results.measures import Z90
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
 
 TARGET = Path(stage.__file__).with_name("vertical_models") / "vertical-force-2.json"
@@ -193,7 +193,7 @@ def report(model: stage.VerticalModel, people: list[Person]) -> None:
                 rms = [
                     100.0 * np.sqrt(np.mean(np.square(v))) for v in ([o[0] for o in off], known, [o[1] for o in off])
                 ]
-                held = np.mean([np.abs(r[2] - r[0]) < WIDTH_SD * r[3] for r in rows])
+                held = np.mean([np.abs(r[2] - r[0]) < Z90 * r[3] for r in rows])
                 name = f"{kind}, {'tuning' if tuning else 'held out'} ({len(group)})"
                 click.echo(f"  {name:24}" + "".join(f"{v:8.1f}" for v in rms) + f"{held:8.0%}")
     click.echo("\npart of a departure from the model's mean that remains, root mean square over time")

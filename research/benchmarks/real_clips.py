@@ -35,6 +35,7 @@ from pbl_pipeline.fit import METHODS, TrialFit, fit_session
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.validation import BODY_ROTATIONS, fit_angles, fit_angles_sd, reference_of_bodies
 from research.clip_keypoints import clip_keypoints
 from research.paths import SHARED
@@ -44,8 +45,6 @@ CLIPS = ("walk", "STS")
 ANGLES = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_flexion", "ankle_angle")
 JOINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "heel", "foot_index")
 MAX_LAG_S = 0.1
-#: Standard deviations to either side of a 90 % interval.
-WIDTH_SD = 1.645
 MOST_DEG, LEAST_CORRELATION, LEAST_WITHIN = 8.0, 0.93, 0.75
 
 
@@ -111,7 +110,7 @@ def within_90(trial: TrialFit, truth: tuple[np.ndarray, dict], lag_s: float) -> 
     if not np.isfinite(trial.qpos_sd[known]).any():
         return float("nan")
     shares = [
-        np.mean(np.abs(angles[n] - np.interp(time, truth[0], v))[known] < WIDTH_SD * sds[n][known])
+        np.mean(np.abs(angles[n] - np.interp(time, truth[0], v))[known] < Z90 * sds[n][known])
         for n, v in truth[1].items()
     ]
     return float(np.mean(shares))
@@ -125,7 +124,7 @@ def page(clip: str, trial: TrialFit, truth: tuple[np.ndarray, dict], peers: dict
     for name in [f"{a}_{side}" for a in ANGLES for side in "rl"]:
         ours, sd, true = angles[name], sds[name], truth[1][name]
         known = np.isfinite(ours) & np.isfinite(sd)
-        low, high = (ours + k * WIDTH_SD * sd for k in (-1, 1))
+        low, high = (ours + k * Z90 * sd for k in (-1, 1))
         ticks = nice_ticks(min(np.nanmin(low), true.min()), max(np.nanmax(high), true.max()))
         axes = Axes((520, 230), (truth[0][0], truth[0][-1]), (ticks[0], ticks[-1]), margin=(36, 8, 8, 22))
         axes.band(time[known], low[known], high[known], "#cfe0f5")

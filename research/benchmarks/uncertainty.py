@@ -33,6 +33,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, GaussNewtonParams, SessionInput, fit_sessions
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
 from pbl_pipeline.methods import Method
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.synthetic import CORRELATED_NOISE, SynthSpec, synthesise
 from research.walker.detectors import BLAZEPOSE_NOISE
 from research.walker.observe import observe
@@ -60,8 +61,8 @@ GROUPS = (
     "pro_sup",
     "wrist",
 )
-#: Standard deviations to either side of a 90 % interval of the normal distribution, and what it should hold.
-WIDTH_SD, SHARE = 1.645, 0.90
+#: What a 90 % interval should hold.
+SHARE = 0.90
 BAND = (0.85, 0.95)
 TIME_S = np.arange(180) / 30
 #: Held-out walks have seeds from here on.
@@ -162,7 +163,7 @@ def columns(names: Sequence[str], group: str) -> list[int]:
 
 def factors_of(errors: np.ndarray, sds: np.ndarray, names: Sequence[str]) -> tuple[tuple[str, float], ...]:
     """(group, factor) with which `SHARE` of the samples lie within the interval."""
-    ratios = errors / sds / WIDTH_SD
+    ratios = errors / sds / Z90
     return tuple((g, round(float(np.quantile(ratios[:, columns(names, g)], SHARE)), 2)) for g in GROUPS)
 
 
@@ -172,7 +173,7 @@ def floors_for(errors: np.ndarray, sds: np.ndarray, names: Sequence[str]) -> tup
     for group in GROUPS:
         at = columns(names, group)
         # A sample lies within from the floor on that makes up for what its own standard deviation lacks.
-        lack = np.sqrt(np.maximum((errors[:, at] / WIDTH_SD) ** 2 - sds[:, at] ** 2, 0.0))
+        lack = np.sqrt(np.maximum((errors[:, at] / Z90) ** 2 - sds[:, at] ** 2, 0.0))
         unit = 100.0 if names[at[0]] in SLIDES else np.rad2deg(1.0)
         found.append((group, round(float(np.quantile(lack, SHARE)) * unit, 1)))
     return tuple(found)
@@ -181,7 +182,7 @@ def floors_for(errors: np.ndarray, sds: np.ndarray, names: Sequence[str]) -> tup
 def coverage(errors: np.ndarray, sds: np.ndarray, names: Sequence[str], params: GaussNewtonParams) -> dict[str, float]:
     """Share of the samples of each group within the interval."""
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(load_body(), params.sd_floor)
-    inside = errors < WIDTH_SD * np.sqrt((sds * factor) ** 2 + floor**2)
+    inside = errors < Z90 * np.sqrt((sds * factor) ** 2 + floor**2)
     return {g: float(np.mean(inside[:, columns(names, g)])) for g in GROUPS}
 
 
