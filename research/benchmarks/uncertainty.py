@@ -61,7 +61,7 @@ GROUPS = (
     "pro_sup",
     "wrist",
 )
-#: What a 90 % interval should hold.
+#: Share of the errors in a 90 % interval.
 SHARE = 0.90
 BAND = (0.85, 0.95)
 TIME_S = np.arange(180) / 30
