@@ -153,7 +153,7 @@ class Icc(Estimate):
 
 
 def minimal_detectable_change(sem: float, confidence: float = 0.95) -> float:
-    """z sqrt(2) SEM: two measurements of an unchanged person differ by more in 1 - confidence of cases.
+    """`minimal_change_of` the standard error of measurement: z sqrt(2) SEM.
 
     Weir 2005. Raises `PblError` STATS_INPUT.
     """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import glob
 import os
 from collections.abc import Iterator, Mapping
@@ -29,7 +28,6 @@ from .videos import check_same_number
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan)
-_kept = functools.partial(PblError, "FILE_UNWRITABLE", expected="the recording in its new folder")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +95,7 @@ def carry_out(plan: Move) -> None:
     folder of its new person, so that `pbl forget` finds it there.
 
     Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
-    cannot be moved, or another process is changing the archive. Nothing is changed then.
+    cannot be moved; DB_REFUSED: another process is changing the archive. Nothing is changed then.
     """
     numbers = list(plan.files)
     of_these = [{"video_id": v} for v in numbers]
@@ -146,9 +144,9 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
             sync_folders(folder, archive)
         except OSError as error:
             _unlink(names.values())
-            raise _kept(
-                error.strerror or str(error), next_step="see that the archive can be written", key=kept[0]
-            ) from error
+            found, expected = error.strerror or str(error), "the recording in its new folder"
+            next_step = "see that the archive can be written"
+            raise PblError("FILE_UNWRITABLE", found, expected, next_step, key=kept[0]) from error
         try:
             yield {number: names.get(path, path) for number, path in plan.files.items()}
         except BaseException:
