@@ -13,8 +13,9 @@ import functools
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Body, marker_positions, marker_set
+from pbl_pipeline.body import PELVIS_TURNS, Body, marker_positions, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MarkerAugmenter
 
@@ -23,9 +24,9 @@ from .session import Session
 
 #: Markers of `opencap_35` on the pelvis.
 SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
-#: A trial with both knees bent by more than this (rad) at once, in more than this share of the frames, is taken for one
-#: with sitting or squatting. So is a walk in a deep crouch (13 % of the frames of one child with cerebral palsy).
-FOLDED_RAD, FOLDED_SHARE = np.deg2rad(60.0), 0.05
+#: A trial with both thighs inclined by more than this (rad) at once, in more than this share of the frames, is one with
+#: sitting or squatting. Recorded walks, in a crouch too, stay below 28 deg; who sits down or squats passes 73 deg.
+FOLDED_RAD, FOLDED_SHARE = np.deg2rad(45.0), 0.05
 
 
 def with_augmented_pelvis(
@@ -60,9 +61,16 @@ def with_augmented_pelvis(
 
 
 def folds(body: Body, qpos: Float[np.ndarray, "T Q"]) -> bool:
-    """True if the person sits or squats for a part of the time."""
-    knees = -qpos[:, [body.joint_names.index(n) for n in ("knee_angle_r", "knee_angle_l")]].max(axis=1)
-    return bool(np.mean(knees > FOLDED_RAD) > FOLDED_SHARE)
+    """True if the person sits or squats for a part of the time: both thighs far from the vertical at once. The knees do
+    not tell it: in a crouched walk they bend as far, over steep thighs."""
+
+    def angles(*names: str) -> np.ndarray:
+        return qpos[:, [body.joint_names.index(n) for n in names]]
+
+    pelvis = Rotation.from_euler("ZXY", angles(*PELVIS_TURNS))
+    hips = [angles(f"hip_flexion_{side}", f"hip_adduction_{side}") * [1, sign] for side, sign in (("r", 1), ("l", -1))]
+    rise = [(pelvis * Rotation.from_euler("ZX", hip)).apply((0, 1, 0))[:, 1] for hip in hips]
+    return bool(np.mean(np.max(rise, axis=0) < np.cos(FOLDED_RAD)) > FOLDED_SHARE)
 
 
 def pelvis_of(markers: Float[np.ndarray, "T 35 3"]) -> Float[np.ndarray, "T 3 3"]:

@@ -42,13 +42,32 @@ def test_a_pelvis_is_found_from_its_spines_and_unknown_without_one():
     assert np.isnan(found[4]).all()
 
 
-def test_who_walks_with_bent_knees_does_not_fold():
+def test_a_crouch_is_no_squat_however_far_the_knees_bend():
+    """Both legs as in mid-stance of a deep crouch: knees at 80 deg under thighs at 40."""
     qpos = np.zeros((100, 40))
-    knees = [BODY.joint_names.index(f"knee_angle_{side}") for side in "rl"]
-    qpos[:, knees[0]] = -np.deg2rad(80.0)
+    at = BODY.joint_names.index
+    qpos[:, [at("knee_angle_r"), at("knee_angle_l")]] = -np.deg2rad(80.0)
+    qpos[:, [at("hip_flexion_r"), at("hip_flexion_l")]] = np.deg2rad(55.0)
+    qpos[:, at("pelvis_tilt")] = -np.deg2rad(15.0)
     assert not folds(BODY, qpos)
-    qpos[:10, knees[1]] = -np.deg2rad(61.0)
+    qpos[:5, at("pelvis_tilt")] = 0.0
+    assert not folds(BODY, qpos)
+    qpos[5, at("pelvis_tilt")] = 0.0
     assert folds(BODY, qpos)
+    qpos[:, at("hip_flexion_r")] = 0.0  # one knee lifted
+    assert not folds(BODY, qpos)
+
+
+def test_inclination_of_the_thighs_is_that_of_the_body():
+    rng = np.random.default_rng(2)
+    turns = [*PELVIS_TURNS, *(f"hip_{n}_{s}" for n in ("flexion", "adduction", "rotation") for s in "rl")]
+    qpos = np.zeros((200, 40))
+    qpos[:, [BODY.joint_names.index(n) for n in turns]] = rng.uniform(-0.9, 0.9, (200, len(turns)))
+    thighs = [BODY.body_names.index(n) for n in ("femur_r", "femur_l")]
+    up = np.asarray(body_poses(BODY, qpos, np.ones(8))[1])[:, thighs, 2, 1]
+    both = np.degrees(np.arccos(up)).min(axis=1) > 45.0
+    assert 20 < both.sum() < 180
+    assert [folds(BODY, frame[None]) for frame in qpos] == both.tolist()
 
 
 class Tipped:
