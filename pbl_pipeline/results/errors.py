@@ -13,7 +13,7 @@ class JointError:
 
     n: frames with both values. median_abs_deg, mean_abs_deg: of |error|. bias_deg: mean error. sd_deg: sd of the error
     (ddof 0), which is its rms without the constant part. rms_deg: bias and sd together. correlation: Pearson's, NaN
-    where one of the two does not move. within_90: fraction of the frames inside 1.645 sd of the fit, NaN without sd.
+    where one of the two does not move. within_90: fraction of the frames inside `Z90` sd of the fit, NaN without sd.
     normal_p: p of the Shapiro-Wilk test of the errors of the frames, NaN for fewer than three or errors all the same.
     """
 

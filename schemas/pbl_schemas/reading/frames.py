@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from pymysql.converters import escape_string
 from pbl_pipeline.records import names
 from pbl_pipeline.results import Gdi
 from pbl_pipeline.results.fits import TrialFigures
+from pbl_pipeline.results.measures import interval_90
 
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
@@ -112,12 +114,10 @@ def force_frame(restriction: Any = True) -> pd.DataFrame:
     """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
     the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
     null if unknown, with the reason in `force_missing`."""
-    from pbl_pipeline.results.measures import Z90
-
     forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
     found = frame_of(current_sets() * forces * kinetics.Kinetics.Measure & restriction)
-    half = Z90 * found["force_sd"].astype(float)
-    found = found.assign(force_low=found["force_mean"] - half, force_high=found["force_mean"] + half)
+    bounds = [interval_90(*v) or (math.nan, math.nan) for v in zip(found["force_mean"], found["force_sd"], strict=True)]
+    found = found.assign(force_low=[low for low, _ in bounds], force_high=[high for _, high in bounds])
     return found.sort_values(["session_id", "force_measure"], kind="stable", ignore_index=True)
 
 
