@@ -48,3 +48,10 @@ class TrialError:
         "error_median_abs", "(deg) median absolute error over all frames and the paper's joints", null=True
     )
     rte_m: float = column("rte", "(m) mean distance of the pelvis paths after alignment, null where unknown", null=True)
+    view_left: str = column(  # as of `view_classes`
+        "error_view_left",
+        "joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)",
+        "varchar(16)",
+        default="mixed",
+    )
+    view_right: str = column("error_view_right", "the same for the right side", "varchar(16)", default="mixed")
