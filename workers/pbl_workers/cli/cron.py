@@ -61,7 +61,7 @@ def import_(settled_s: float) -> None:
     finally:
         signal.alarm(0)
     if taken is None:
-        click.echo(busy("the next run takes the rest").text(), err=True)
+        click.echo(busy("the next run takes the rest").short(), err=True)
         raise click.exceptions.Exit(BUSY)
     click.echo(
         f"{len(taken.registered)} registered, {len(taken.known)} known, {len(taken.refused)} refused, "
