@@ -19,7 +19,8 @@ VIEW = "view"
 WHAT = ("aid", "orthosis", "pace", "height", "camera", "picture", VIEW)
 #: Lowest number of pixels of the shorter side of a picture, and what such pictures are called.
 _PICTURES = ((1400, "2160p"), (900, "1080p"), (600, "720p"), (0, "480p"))
-_VIEWS = {"right": "left", "left": "right"}  # the camera is on the other side of the leg that is behind
+#: Leg that is behind the other -> side from which it is filmed.
+FILMED_FROM = {"right": "left", "left": "right"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +99,7 @@ def views_of(cycles: Iterable[tuple[str | int, str]]) -> tuple[str, ...]:
         for (recording, far), n in counts.items()
         if n >= (SIDE_SHARE if far else FRONT_SHARE) * of_recording[recording]
     }
-    return known(_VIEWS.get(far, FRONT_OR_BACK) for far in enough)
+    return known(FILMED_FROM.get(far, FRONT_OR_BACK) for far in enough)
 
 
 def known(words: Iterable[str]) -> tuple[str, ...]:

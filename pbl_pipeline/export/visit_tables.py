@@ -133,15 +133,6 @@ class _Cycle(NamedTuple):
     forces: CycleKinetics | None
 
 
-_CYCLE_TIMES = {
-    "start_s": "initial contact",
-    "opposite_foot_up_s": "toe-off of the other foot",
-    "opposite_foot_down_s": "initial contact of the other foot",
-    "foot_up_s": "toe-off",
-    "end_s": "next initial contact",
-}
-
-
 def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[Column]:
     return [
         Column("trial", _repeated([n for n, _ in cycles], each), "", _TRIAL),
@@ -154,11 +145,13 @@ def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[
 def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
     """`pooled`: names of the trials whose cycles are pooled for the measures of the visit."""
     values = [measures_of(c.cycle) for c in cycles]
+    meant = meanings(GaitCycle)
     columns = _cycle_keys([c[:2] for c in cycles])
     columns.append(Column("bout", _integers(c.cycle.bout for c in cycles), "", "walking bout, from 0"))
     columns += [
         Column(name, _floats(getattr(c.cycle, name) for c in cycles), "s", f"{text}, from the first frame of the video")
-        for name, text in _CYCLE_TIMES.items()
+        for name, text in meant.items()
+        if name.endswith("_s")
     ]
     for name in (m for m in MEASURES if m != "step_time_s"):
         column = _floats(v.get(name, np.nan) for v in values)
@@ -166,7 +159,7 @@ def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
     columns += [
         Column("gdi", _floats(c.gdi for c in cycles), "", "Gait Deviation Index of the cycle"),
         Column("pooled", np.array([c.trial in pooled for c in cycles], bool), "", "whether the visit pools its trial"),
-        Column("far_leg", Texts.of([c.cycle.far_leg for c in cycles]), "", "leg that the other hid from the camera"),
+        Column("far_leg", Texts.of([c.cycle.far_leg for c in cycles]), "", meant["far_leg"]),
         Column("excluded", Texts.of([c.cycle.excluded for c in cycles]), "", "why it is not part of the measures"),
     ]
     for name in KINETICS:

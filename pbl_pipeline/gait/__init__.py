@@ -6,8 +6,8 @@ Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keyp
 
 from pbl_pipeline.results.cycles import BODY_ANGLES, Exclusion, GaitCycle, Lengths
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
-from pbl_pipeline.results.index import GDI_MODEL, GILLETTE_MODEL, NUMBERS, PAPER_INDEX, Gdi, GdiCycle, interval_90
-from pbl_pipeline.results.measures import Z90, Measure
+from pbl_pipeline.results.index import GDI_MODEL, GILLETTE_MODEL, NUMBERS, PAPER_INDEX, Gdi, GdiCycle
+from pbl_pipeline.results.measures import Z90, Measure, interval_90
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
 from ._bands import CURVE_FRAME_COLUMNS, AdultRanges, NormalBands, adult_ranges, curve_frame, leg_length_m, normal_bands

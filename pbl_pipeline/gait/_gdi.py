@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import FILMED_FROM
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
@@ -244,8 +245,7 @@ def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str
     if model is None:
         return {}
     passes = with_doubts(model, passes_of(usable, basis))
-    filmed_from = {LEFT: RIGHT, RIGHT: LEFT, "": ""}  # the leg that is behind
-    return {filmed_from[k]: Z90 * sd for k, sd in with_one_more(model, passes, basis).items()}
+    return {FILMED_FROM.get(k, k): Z90 * sd for k, sd in with_one_more(model, passes, basis).items()}
 
 
 def _model_of_error(cycles: Sequence[GaitCycle], norm: NormativeSet, params: GdiParams) -> MeasurementModel | None:

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from scipy.special import gammaincc
 
 from pbl_pipeline.results.events import LEFT, RIGHT
-from pbl_pipeline.results.measures import Z90
+from pbl_pipeline.results.measures import minimal_change_of
 from pbl_pipeline.shipped import shipped_model
 
 from .cycle_measures import CYCLE_SPREAD, sampling_sd
@@ -65,7 +65,7 @@ def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float], re
     remains
         `REMAINS` or `MEASURES_REMAIN`.
     """
-    anew = sum(c**2 for c in minimal_changes) / (2.0 * Z90**2)
+    anew = sum((c / minimal_change_of(1.0)) ** 2 for c in minimal_changes)
     whole = sum(s**2 for s in sds)
     return math.sqrt(anew + remains * max(whole - anew, 0.0))
 

@@ -52,6 +52,9 @@ from .types import Condition
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
+#: Number of used cycles that measures need, and the one below which they are few.
+LEAST_CYCLES, FEW_CYCLES = 1.0, 4.0
+
 
 @dataclasses.dataclass(frozen=True)
 class GaitParams:
@@ -331,10 +334,10 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
     curves = warn_if(unlike, "cycles_of_odd_curves", float(unlike), 0.0, far_off)
     cadence = _cadence_check(measures, cycles)
     if measures.status == EMPTY:
-        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()), *cadence)
+        return (Check("cycles_used", EMPTY, 0.0, LEAST_CYCLES, measures.reason), *((lengths,) if odd else ()), *cadence)
     n = measures.n_cycles_used
     few = "few cycles: film a longer stretch, or several passes"
-    checks = [warn_if(n < 4, "cycles_used", float(n), 4.0, few), lengths, curves]
+    checks = [warn_if(n < FEW_CYCLES, "cycles_used", float(n), FEW_CYCLES, few), lengths, curves]
     if any(c.used for c in cycles):
         checks.append(legs_check(cycles))
     checks += cadence

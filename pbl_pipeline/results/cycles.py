@@ -116,11 +116,11 @@ class GaitCycle:
     number: int = column("cycle_no", "in order of time, both sides together, from 0", "int16", key=True)
     bout: int = column("cycle_bout", "walking bout, from 0", "int16")
     side: str = column("cycle_side", type="enum('left', 'right')", before="bout")
-    start_s: float = column("cycle_start", "(s) foot down")
-    opposite_foot_up_s: float = column("opposite_foot_up", "(s)")
-    opposite_foot_down_s: float = column("opposite_foot_down", "(s)")
-    foot_up_s: float = column("cycle_foot_up", "(s)")
-    end_s: float = column("cycle_end", "(s) next foot down of the same side")
+    start_s: float = column("cycle_start", "(s) foot down", meaning="initial contact")
+    opposite_foot_up_s: float = column("opposite_foot_up", "(s)", meaning="toe-off of the other foot")
+    opposite_foot_down_s: float = column("opposite_foot_down", "(s)", meaning="initial contact of the other foot")
+    foot_up_s: float = column("cycle_foot_up", "(s)", meaning="toe-off")
+    end_s: float = column("cycle_end", "(s) next foot down of the same side", meaning="next initial contact")
     exclusion: Exclusion = dataclasses.field(default_factory=Exclusion)
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_missing: str = column("curves_missing", "why it has no curves", "varchar(1000)", cut=True, default="")
@@ -132,6 +132,7 @@ class GaitCycle:
         "the leg that one camera saw behind the other, if one",
         "enum('left', 'right')",
         null=True,
+        meaning="leg that the other hid from the camera",
         before="lengths",
         default="",
     )

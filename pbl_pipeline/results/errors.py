@@ -13,7 +13,7 @@ class JointError:
 
     n: frames with both values. median_abs_deg, mean_abs_deg: of |error|. bias_deg: mean error. sd_deg: sd of the error
     (ddof 0), which is its rms without the constant part. rms_deg: bias and sd together. correlation: Pearson's, NaN
-    where one of the two does not move. within_90: fraction of the frames inside 1.645 sd of the fit, NaN without sd.
+    where one of the two does not move. within_90: fraction of the frames inside `Z90` sd of the fit, NaN without sd.
     normal_p: p of the Shapiro-Wilk test of the errors of the frames, NaN for fewer than three or errors all the same.
     """
 
@@ -48,3 +48,10 @@ class TrialError:
         "error_median_abs", "(deg) median absolute error over all frames and the paper's joints", null=True
     )
     rte_m: float = column("rte", "(m) mean distance of the pelvis paths after alignment, null where unknown", null=True)
+    view_left: str = column(  # as of `view_classes`
+        "error_view_left",
+        "joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)",
+        "varchar(16)",
+        default="mixed",
+    )
+    view_right: str = column("error_view_right", "the same for the right side", "varchar(16)", default="mixed")

@@ -11,7 +11,7 @@ import numpy as np
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import column, plain, record
 
-from .measures import Z90
+from .measures import interval_90
 
 
 @record
@@ -42,7 +42,7 @@ class KineticMeasure:
     @property
     def interval(self) -> tuple[float, float] | None:
         """90 % interval of the mean."""
-        return None if self.sd is None else (self.mean - Z90 * self.sd, self.mean + Z90 * self.sd)
+        return interval_90(self.mean, self.sd)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the measure for JSON."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,7 @@ from pbl_pipeline.records import column, plain, record
 from pbl_pipeline.words import number
 
 from .events import RIGHT
-from .measures import Z90, Spatiotemporal
+from .measures import MINIMAL_CHANGE, Spatiotemporal, interval_90
 
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
@@ -105,10 +104,10 @@ class Gdi:
 
     `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
     a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
-    index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
-    detectable change (90 %) between two visits filmed alike. `unshrunk`: the index without people's distribution as
-    prior knowledge of this person, for correlations and means over people; `mean` where that knows nothing of them
-    either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
+    index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change` as of
+    `Measure`. `unshrunk`: the index without people's distribution as prior knowledge of this person, for correlations
+    and means over people; `mean` where that knows nothing of them either; None where it is too uncertain
+    (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
     """
 
     status: str = column("{}_status", type="enum('PASS', 'EMPTY')")
@@ -132,7 +131,7 @@ class Gdi:
         default=None,
     )
     minimal_change: float | None = column(
-        "{}_minimal_change", "(-) minimal detectable change (90 percent) between two such visits", default=None
+        "{}_minimal_change", f"(-) {MINIMAL_CHANGE} between two such visits", default=None
     )
     unshrunk: float | None = column(
         "{}_unshrunk",
@@ -196,10 +195,3 @@ def numbers_of(told: Mapping[str, Any]) -> dict[str, float | None]:
     if (numbers["sd"] is None) != (numbers["minimal_change"] is None):
         raise ValueError("an index with one of sd and minimal_change")
     return {n: None if value is None else float(value) for n, value in numbers.items()}
-
-
-def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
-    """The 90 % interval of an index whose error has the standard deviation `sd`; None if one is not known."""
-    if mean is None or sd is None or not math.isfinite(sd):
-        return None
-    return mean - Z90 * sd, mean + Z90 * sd

@@ -21,6 +21,15 @@ def minimal_change_of(sd_anew: float, confidence: float = 0.9) -> float:
     return float(-ndtri((1 - confidence) / 2) * math.sqrt(2) * sd_anew)
 
 
+def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
+    """The 90 % interval of a value whose error has the standard deviation `sd`; None if one is not known."""
+    if mean is None or sd is None or not math.isfinite(sd):
+        return None
+    return mean - Z90 * sd, mean + Z90 * sd
+
+
+#: Meaning of a column `minimal_change`.
+MINIMAL_CHANGE = "minimal detectable change (90 percent)"
 #: Fields of `Measure` that those of a visit have, not those of a trial.
 OF_VISIT = ("error_sd", "minimal_change")
 #: Fields of `Spatiotemporal` that stand in the row of the cycles.
@@ -72,7 +81,7 @@ class Measure:
     )
     minimal_change: float | None = column(
         "{}_minimal_change",
-        "in the unit (see {}): minimal detectable change (90 percent)",
+        f"in the unit (see {{}}): {MINIMAL_CHANGE}",
         meaning="minimal detectable change (90 %) between two visits filmed alike",
         default=None,
     )
@@ -91,7 +100,7 @@ class Measure:
         The sd is `variability` if it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
         """
         if self.error_sd is not None:
-            return self.mean - Z90 * self.error_sd, self.mean + Z90 * self.error_sd
+            return interval_90(self.mean, self.error_sd)
         from scipy.special import stdtrit  # not `scipy.stats`, which takes longer to import than most commands run
 
         sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)

@@ -31,7 +31,6 @@ from .align import (
 from .reference import (
     JOINTS_OPENCAP,
     JOINTS_PAPER,
-    MIXED,
     Reference,
     pelvis_angles_deg,
     pelvis_rotations,
@@ -88,8 +87,6 @@ class KinematicErrors(TrialError):
     """Errors of one trial against its reference."""
 
     joints: tuple[JointError, ...]  # one entry per joint that both know, in the order of the reference
-    #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
-    view: Mapping[str, str] = dataclasses.field(default_factory=lambda: dict.fromkeys(("right", "left"), MIXED))
     #: Medians of the fit's residuals over frames and markers.
     residual_2d_px: float = column("trial_residual_2d", null=True, default=float("nan"))
     residual_3d_cm: float = column("trial_residual_3d", null=True, default=float("nan"))
@@ -144,7 +141,7 @@ def compare(
     )
     return dataclasses.replace(
         result,
-        view=view_of_fit(fit, poses),
+        **{f"view_{side}": view for side, view in view_of_fit(fit, poses).items()},
         residual_2d_px=_median(fit.residual_2d_px),
         residual_3d_cm=100 * _median(fit.residual_3d_m),
     )

@@ -83,7 +83,7 @@ def error_frame(rows: Iterable[TrialErrors]) -> pd.DataFrame:
 def _view(row: TrialErrors, side: str) -> str:
     if row.camera == SEVERAL:
         return ""
-    view = row.errors.view["left" if side == "l" else "right"]
+    view = row.errors.view_left if side == "l" else row.errors.view_right
     return LATERAL if not side and view in (IPSILATERAL, CONTRALATERAL) else view
 
 

@@ -34,6 +34,7 @@ from pbl_pipeline.gait.measurement import (
     measure_error,
 )
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
+from pbl_pipeline.results.measures import minimal_change_of
 from research.corpus.passes import ANGLES, PASSES, SESSIONS, STEP_DEG
 from research.corpus.walks import ANYWHERE, HEALTHY, THERE_AND_BACK
 
@@ -322,7 +323,7 @@ def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) ->
                 "true": norm.index_of_scores(true).mean(),
                 "found": found.mean,
                 "sd": found.sd,
-                "sd_anew": (found.minimal_change or np.nan) / (np.sqrt(2.0) * Z90),
+                "sd_anew": (found.minimal_change or np.nan) / minimal_change_of(1.0),
                 "unshrunk": found.unshrunk,
                 "unshrunk_sd": found.unshrunk_sd,
                 "disagree": any(c.check == "passes_agree" and c.advice for c in found.qc),

@@ -183,9 +183,9 @@ class GaitCycle(dj.Computed):
     -> session.Session
     -> [nullable] EventCorrection
     {definition(Measures, only=COUNTS)}
-    curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve and curve_sd (N,A,P) deg
+    curves          : <object@arrays>          # cycles.npz
     {origin_columns("cycles")}
-    """  # noqa: E501
+    """
 
     Cycle = part_of("Cycle", Cycle)
 

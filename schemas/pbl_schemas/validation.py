@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from pbl_pipeline.records import definition, from_row, to_row
+from pbl_pipeline.records import definition, to_row
 from pbl_pipeline.results import JointError, TrialError
 
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
@@ -54,10 +54,8 @@ class KinematicError(dj.Computed):
     ---
     -> session.Session
     {definition(TrialError)}
-    error_view_left       : varchar(16)        # joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)
-    error_view_right      : varchar(16)        # the same for the right side
     {origin_columns("error")}
-    """  # noqa: E501
+    """
 
     Joint = part_of("Joint", JointError)
 
@@ -83,18 +81,5 @@ class KinematicError(dj.Computed):
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
         from pbl_pipeline.validation import OF_OTHERS
 
-        row = to_row(errors, without=OF_OTHERS) | {f"error_view_{side}": v for side, v in errors.view.items()}
-        self.insert1({**fit.of_session(key), **row, **origin.row("error")})
+        self.insert1({**fit.of_session(key), **to_row(errors, without=OF_OTHERS), **origin.row("error")})
         self.Joint.insert_records(key, errors.joints)
-
-
-def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> lib.KinematicErrors:
-    """The library's `KinematicErrors` from a row of KinematicError joined with its trial and reference, and its joints.
-
-    The residuals are those of the trial, which are not stored again here.
-    """
-    from pbl_pipeline import validation as lib
-
-    view = {side: row[f"error_view_{side}"] for side in ("left", "right")}
-    own = tuple(from_row(JointError, joint) for joint in joints)
-    return from_row(lib.KinematicErrors, row, joints=own, view=view)

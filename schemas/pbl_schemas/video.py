@@ -213,12 +213,7 @@ def probed(key: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 def read_probed(row: Mapping[str, Any], times: Mapping[str, Any], key: dict) -> tuple[Path, Info]:
     """Return the file and the facts of a video from what `probed` returned. Raises as `registered_file`."""
     path = registered_file(row["video_path"], row["video_sha256"], key)
-    return path, info_of_row(row, read_stored(times, functools.partial(np.load, allow_pickle=False)))
-
-
-def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Info:
-    """The library's `VideoInfo` from a joined row of Video and VideoInfo and the array in `frame_time`."""
-    return from_row(Info, row, time_s=time_s)
+    return path, from_row(Info, row, time_s=read_stored(times, functools.partial(np.load, allow_pickle=False)))
 
 
 def conditions(videos: Any) -> dict[int, Condition]:
@@ -250,7 +245,7 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
     if row["camera_id"] is not None:
         return {**one(lab.CameraCalibration & {"camera_id": row["camera_id"]}), "turn_deg": 0}
-    lens = phone_lens(info_of_row(row, np.zeros(0)))
+    lens = phone_lens(from_row(Info, row, time_s=np.zeros(0)))
     if lens is None:
         return None
     of_device = (lab.DeviceCalibration & (lab.Device & lab.device_columns(lens)) & lab.mode_columns(lens)).to_dicts()

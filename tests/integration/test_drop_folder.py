@@ -162,7 +162,7 @@ def test_a_lock_that_is_held_is_reported(drop: Path):
         assert obtained
         held = pbl("cron", "import")
         assert (held.code, held.out) == (75, "")
-        assert "another process" in held.err
+        assert "are being taken over" in held.err
         upload(drop, "P017/1/walk.mp4")
         assert pbl("forget", "P017", "--yes").error_code == "DB_REFUSED"
     other.close()

@@ -285,8 +285,10 @@ def test_the_error_of_a_measure_by_the_number_and_spread_of_cycles(n, own, sprea
 
 @pytest.mark.parametrize("by", [-7.0, 7.0])
 def test_probabilities_of_a_change_are_those_of_a_normal_error(by):
-    assert change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (3.0, 3.0)) == pytest.approx(np.sqrt(18.0))  # all is anew
-    sd = change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (5.0, 5.0))
+    assert change_sd((normal.ppf(0.95) * np.sqrt(2.0) * 3.0,) * 2, (3.0, 3.0)) == pytest.approx(
+        np.sqrt(18.0)
+    )  # all is anew
+    sd = change_sd((normal.ppf(0.95) * np.sqrt(2.0) * 3.0,) * 2, (5.0, 5.0))
     assert sd == pytest.approx(np.sqrt(18.0 + 0.3 * (50.0 - 18.0)))
     assert chances(by, sd).real == pytest.approx(normal.cdf(7.0 / sd))
     assert chances(by, sd).important is None

@@ -501,9 +501,9 @@ def test_the_view_of_a_fit(fit: TrialFit):
     for turn in (0.0, np.pi):
         qpos = fit.qpos.copy()
         qpos[:, column] += turn
-        seen[turn] = compare(dataclasses.replace(fit, qpos=qpos), reference_of_fit(fit, "x")).view
-    assert seen[0.0] == {"right": "contralateral", "left": "ipsilateral"}
-    assert seen[np.pi] == {"right": "ipsilateral", "left": "contralateral"}
+        seen[turn] = compare(dataclasses.replace(fit, qpos=qpos), reference_of_fit(fit, "x"))
+    assert (seen[0.0].view_right, seen[0.0].view_left) == ("contralateral", "ipsilateral")
+    assert (seen[np.pi].view_right, seen[np.pi].view_left) == ("ipsilateral", "contralateral")
 
 
 # --- real data

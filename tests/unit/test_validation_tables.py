@@ -65,7 +65,8 @@ def _trial(
         joints=joints,
         median_abs_deg=median,
         rte_m=rte_m,
-        view={"right": view[0], "left": view[1]},
+        view_right=view[0],
+        view_left=view[1],
         residual_2d_px=residual_px,
         residual_3d_cm=1.0,
     )

@@ -19,7 +19,8 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
-from pbl_pipeline.records import number, to_row
+from pbl_pipeline.records import from_row, number, to_row
+from pbl_pipeline.results import VideoInfo
 
 from .. import keypoints, lab, video
 from ..queues import forget_errors
@@ -164,7 +165,7 @@ def _outdated(key: dict[str, Any]) -> list[dict[str, Any]]:
     registered = (lab.DeviceCalibration & key).to_dicts()
     counts: dict[int, int | None] = {}
     for row in recorded.proj(..., "-frame_time").to_dicts() if made else ():
-        lens = phone_lens(video.info_of_row(row, np.zeros(0)))
+        lens = phone_lens(from_row(VideoInfo, row, time_s=np.zeros(0)))
         if lens is None or any(key[name] != value for name, value in lab.mode_columns(lens).items()):
             continue
         fits = bool(registered) and lens.same_focal(number(registered[0]["device_focal_35mm"]))

@@ -181,9 +181,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     try:
         with worker.installation_lock(archive.LOCK, connection.connect()) as obtained:
             if not obtained:
-                expected = "no import, so that no recording appears after it was deleted"
-                next_step = "repeat this when it has ended"
-                raise PblError("DB_REFUSED", "`pbl cron import` is running", expected, next_step, key=subject)
+                raise archive.busy("repeat this when it has ended", subject)  # else a recording may appear afterwards
             return _forget(subject, videos, say)
     except RightMissing as error:  # the account that may also remove the files of the store
         raise RightMissing(error.found, "owner") from error

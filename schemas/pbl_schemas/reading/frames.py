@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from pymysql.converters import escape_string
 
-from pbl_pipeline.records import names
-from pbl_pipeline.results import Gdi
+from pbl_pipeline.records import from_row, names
+from pbl_pipeline.results import Gdi, JointError
 from pbl_pipeline.results.fits import TrialFigures
+from pbl_pipeline.results.measures import interval_90
 
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
@@ -112,12 +114,10 @@ def force_frame(restriction: Any = True) -> pd.DataFrame:
     """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
     the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
     null if unknown, with the reason in `force_missing`."""
-    from pbl_pipeline.results.measures import Z90
-
     forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
     found = frame_of(current_sets() * forces * kinetics.Kinetics.Measure & restriction)
-    half = Z90 * found["force_sd"].astype(float)
-    found = found.assign(force_low=found["force_mean"] - half, force_high=found["force_mean"] + half)
+    bounds = [interval_90(*v) or (math.nan, math.nan) for v in zip(found["force_mean"], found["force_sd"], strict=True)]
+    found = found.assign(force_low=[low for low, _ in bounds], force_high=[high for _, high in bounds])
     return found.sort_values(["session_id", "force_measure"], kind="stable", ignore_index=True)
 
 
@@ -259,7 +259,7 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialErrors]]:
     """Key and `TrialErrors` of each current fit against each current reference of its video."""
-    from pbl_pipeline.validation import TrialErrors
+    from pbl_pipeline.validation import KinematicErrors, TrialErrors
 
     references = validation.ReferenceKinematics & {"reference_current": True}
     compared = (
@@ -273,9 +273,9 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialEr
         * lab.Subject.proj("population")
     ) & restriction
     names = validation.KinematicError.primary_key
-    joints: dict[tuple, list[dict[str, Any]]] = {}
+    joints: dict[tuple, list[JointError]] = {}
     for row in (validation.KinematicError.Joint & compared.proj()).to_dicts(order_by="KEY"):
-        joints.setdefault(tuple(row[k] for k in names), []).append(row)
+        joints.setdefault(tuple(row[k] for k in names), []).append(from_row(JointError, row))
     found = compared.to_dicts(order_by="video_id, fit_set, fit_method, reference")
     n_references = Counter((row["fit_set"], row["fit_method"], row["video_id"]) for row in found)
     for row in found:
@@ -285,7 +285,7 @@ def _compared(restriction: Any = True) -> Iterator[tuple[dict[str, Any], TrialEr
             trial += f" against {row['reference_source']}"
         key = {k: row[k] for k in names}
         about = TrialErrors(
-            errors=validation.errors_of_rows(row, joints.get(tuple(key.values()), [])),
+            errors=from_row(KinematicErrors, row, joints=tuple(joints.get(tuple(key.values()), ()))),
             # One of several cameras stands still, fitted together with the others or alone.
             camera="handheld" if row["camera_motion"] == "handheld" else "static",
             trial=trial,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError, as_said, joined, said
 from pbl_pipeline.names import distinct
 from pbl_pipeline.records import from_row
-from pbl_pipeline.results import SubjectChoice
+from pbl_pipeline.results import SubjectChoice, VideoInfo
 from pbl_pipeline.texts import LANGUAGES
 
 from .. import fit, gait, gdi, keypoints, privacy, session, tracking, video
@@ -272,7 +272,7 @@ def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows
         "number": number,
     }
     if probed := rows(video.VideoInfo, of_video):
-        about["video"] = video.info_of_row({**row, **probed[0]}, probed[0]["frame_time"].load())
+        about["video"] = from_row(VideoInfo, {**row, **probed[0]}, time_s=probed[0]["frame_time"].load())
     if key is None:
         choices = rows(tracking.SubjectChoice, of_video)
         choice = from_row(SubjectChoice, choices[0]) if len(choices) == 1 else None

@@ -51,6 +51,7 @@ def import_(settled_s: float) -> None:
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
     import pbl_schemas
+    from pbl_schemas.operations.archive import busy
     from pbl_workers.incoming import import_uploads
 
     signal.alarm(AT_MOST_S)
@@ -60,7 +61,7 @@ def import_(settled_s: float) -> None:
     finally:
         signal.alarm(0)
     if taken is None:
-        click.echo("another process takes uploads over now", err=True)
+        click.echo(busy("the next run takes the rest").short(), err=True)
         raise click.exceptions.Exit(BUSY)
     click.echo(
         f"{len(taken.registered)} registered, {len(taken.known)} known, {len(taken.refused)} refused, "

@@ -17,6 +17,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     SIDED,
+    THREE_ANGLES,
     AdultRanges,
     NormalBands,
     adult_ranges,
@@ -43,8 +44,8 @@ from .computing import told as told_of
 from .pages import as_json, plain, reader_language
 from .phone import usual_words, verdict
 
-#: Angles of the first screen: those of the index of three angles, and the ankle.
-SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
+#: Angles of the first screen.
+SHOWN = (*THREE_ANGLES, "ankle_dorsiflexion")
 #: Recordings in the overview of a letter, and the longer side of its pictures (px).
 _OVERVIEW, _OVERVIEW_PX = 2, 240
 
