@@ -59,7 +59,7 @@ Each section is a schema of the server, `pbl_<section>`, in the order of computi
 those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has. `A.B.C` is a part of
 `A.B` and has its key. *as in* a table: the same columns without `session_`.
 
-`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.
+`T.heading` of a table T prints all types. `sd` is a standard deviation.
 Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*unit*: that in the
 name of the check or measure). Times are in UTC, in `worker` by the server's clock. Unless stated, null means not known, `_created` when the row was
 made, `_by` who decided, by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that
