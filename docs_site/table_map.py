@@ -61,7 +61,7 @@ those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` i
 
 `T.heading` of a table T prints all types. `sd` is a standard deviation.
 Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*unit*: that in the
-name of the check or measure). Times are in UTC, in `worker` by the server's clock. Unless stated, null means not known, `_created` when the row was
+name of the check or measure). Times are in UTC, by the server's clock. Unless stated, null means not known, `_created` when the row was
 made, `_by` who decided, by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that
 stand for columns with a prefix:
 
