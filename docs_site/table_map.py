@@ -210,7 +210,7 @@ def _type(text: str) -> str:
 def _meaning(column: str, type_: str, text: str) -> str:
     """The comment of a column, less what the top of the page states for all."""
     if type_ == "datetime":
-        text = re.sub(r",? UTC$", "", text)
+        text = re.sub(r"(^|,? )UTC$", "", text)
     text = re.sub(r"(: [^;]*)?; docs/files\.md$", "", text)
     text = "" if any(column.endswith(end) and text in said for end, said in _SAID.items()) else text
     for long, short in _SHORTER.items():
