@@ -17,7 +17,7 @@ _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "co
 _Column = tuple[str, str, str, bool]
 #: Prefix of a visit's columns, where a trial has the same ones without it.
 _VISIT = "session_"
-_KINDS = {dj.Manual: "", dj.Lookup: " (lookup)", dj.Computed: " (computed)", dj.Part: " (part)"}
+_KINDS = {dj.Manual: "", dj.Lookup: " (lookup)", dj.Computed: " (computed)", dj.Part: ""}
 #: Columns of a method and of a check after their prefix: they stand at the top of the page, each table has the word.
 _GROUPS = {
     "method": ("_method", "_method_name", "_method_version", "_params", "_method_sha"),
@@ -33,12 +33,17 @@ _SAID = {
     "_reason": ("why EMPTY",),
     "_missing": ("why it is null",),
     "_file": ("the file",),
+    "_check": ("name, with its unit",),
+    "measure": ("name, with its unit",),
 }
 #: Endings and words of a meaning that the top of the page states for all tables.
 _SHORTER = {
     r"[,;] (null|empty) (when|where|if) (it was )?(not known|unknown|not estimated|not recorded)$": "",
     r"[,;] null: not known$": "",
     r"standard deviation\b": "sd",
+    r"(, |^)clock of the database server$": "",
+    r"in the unit \(see \w*(check|measure)\)": "(unit)",
+    r"in the unit \(see ([\w.]+)\)": r"(\1)",
 }
 #: Types that a reader asks the server for.
 _PLAIN = re.compile(r"bool|float64|(var)?char\(\d+\)|int\d+|datetime(\(3\))?|date")
@@ -51,19 +56,20 @@ _START = """\
 # Tables
 
 Each section is a schema of the server, `pbl_<section>`, in the order of computing. `pbl populate` fills *computed* tables, people and `pbl ingest`
-those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part has the key
-of its table. *as in* a table: the same columns without `session_`.
+those without a word; *lookup* tables hold terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has. `A.B.C` is a part of
+`A.B` and has its key. *as in* a table: the same columns without `session_`.
 
-`T.heading` of a table T prints all types. In what a column means, sd is a standard deviation.
-Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*its unit*: that in the
-name of the row). Times are in UTC. Unless stated, null means not known, `_created` when the row was made, `_by` who decided, by name, `_sha256` that of
-the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
+`T.heading` of a table T prints all types. `sd` is a standard deviation.
+Terms, json and files (`<object@arrays>`: [formats](files.md)) state their type, a column with a unit in brackets is float64 (*unit*: that in the
+name of the check or measure). Times are in UTC, by the server's clock. Unless stated, null means not known, `_created` when the row was
+made, `_by` who decided, by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that
+stand for columns with a prefix:
 
 - *origin*, where a row of each computed table comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
 - *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
   `_method_sha`, hash of all these. Lookup tables of frozen parameters have these columns only (in brackets: their prefix): @METHOD@
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
-  `_check_threshold` (its unit); `_check_advice`: what to do about it. Parts with these columns only: @CHECK@
+  `_check_threshold` (unit); `_check_advice`: what to do about it. Parts with these columns only: @CHECK@
 
 Made by `python -m docs_site.table_map`; do not edit.
 """  # noqa: E501
@@ -179,7 +185,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
         elif n:
             rows.append((f"{column}, ..., {own[i + n - 1][0]}", f"as in {alike}", "", in_key))
         else:
-            said = (_type(type_), _meaning(column, type_, text, own[0][0]), in_key)
+            said = (_type(type_), _meaning(column, type_, text), in_key)
             if rows and rows[-1][1:] == said:
                 rows[-1] = (f"{rows[-1][0]}, {column}", *said)
             else:
@@ -201,15 +207,15 @@ def _type(text: str) -> str:
     return "" if _PLAIN.fullmatch(text) else text.replace("', '", "','")
 
 
-def _meaning(column: str, type_: str, text: str, key: str) -> str:
+def _meaning(column: str, type_: str, text: str) -> str:
     """The comment of a column, less what the top of the page states for all."""
     if type_ == "datetime":
-        text = re.sub(r",? UTC$", "", text)
+        text = re.sub(r"(^|,? )UTC$", "", text)
     text = re.sub(r"(: [^;]*)?; docs/files\.md$", "", text)
     text = "" if any(column.endswith(end) and text in said for end, said in _SAID.items()) else text
     for long, short in _SHORTER.items():
         text = re.sub(long, short, text)
-    return text.replace(f"in the unit (see {key})", "(its unit)")
+    return text
 
 
 def _line(row: tuple[str, str, str], wide: int) -> list[str]:

@@ -35,7 +35,7 @@ class Unknowns(enum.Enum):
     SOLE_AND_FLOOR = "joints, scale, floor"
     SOLE_IN_TWO_FRAMES = "joints of two frames, scale"
     SEGMENT_IN_TWO_FRAMES = "joints of two frames, sensors' alignment, bias, clock"
-    SHARED = "what all frames share"
+    SHARED = "common unknowns"
 
 
 class Phone(NamedTuple):
