@@ -278,6 +278,9 @@ def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, engl
         about = (action, name, [v[:12] for v in values])
         if answer.status_code == 303:
             continue
+        if name == "segment" and values != [""]:  # a list that nobody types into: another value is no form of the page
+            assert answer.status_code == 415, about
+            continue
         assert answer.status_code in (200, 400, 409), about
         assert "INTERNAL" not in answer.text, about
         shown = re.sub(r"(?s)<datalist.*?</datalist>", "", answer.text)
