@@ -23,6 +23,8 @@ from pbl_pipeline.names import is_plain
 
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
+#: Endings of recordings.
+VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
 #: Largest width or height (px) of a picture that a file names.
 _WIDEST_PX = 100_000
 #: Free space (MB) below which no work is begun; the results of the demo take 3.

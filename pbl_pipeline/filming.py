@@ -9,6 +9,9 @@ from collections.abc import Iterable
 
 from pbl_pipeline.texts import code_of
 
+#: Kinds of sets of recordings, which are never fitted, pooled or averaged with one another: videos of one camera each,
+#: trials of several calibrated cameras, marker recordings.
+KINDS = SINGLE, RIG, MARKERS = "single", "rig", "markers"
 #: Least fraction of a recording's cycles that makes a side a view (a turn at the end is not one), and that makes front
 #: or back one: a pass along the camera's axis begins and ends obliquely.
 SIDE_SHARE, FRONT_SHARE = 0.25, 0.5
@@ -74,8 +77,11 @@ def stated(kind: str, text: str) -> tuple[str, ...]:
     return (word,) if word else ()
 
 
-def height_word(height_m: float | None) -> str:
-    """Return the word of `Filming.height` for the body height that the fit was told (m); None or NaN for none."""
+def height_word(height_m: float | None, with_depths: bool) -> str:
+    """Return the word of `Filming.height` for the body height that a fit was told (m; None or NaN for none), and
+    whether it had depths."""
+    if with_depths:
+        return "depths"
     return "not_stated" if height_m is None or math.isnan(height_m) else "stated"
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pbl_pipeline import filming
 from pbl_pipeline.errors import PblError
 
 from .options import (
@@ -111,7 +112,7 @@ def fit(
     session = fit_session(trials, names, paramset, motion, height_m=height_m, **more)
     recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
     laboratory = all(isinstance(trial, WorldMarkers) for trial in trials)
-    kind = "rig" if cameras else "markers" if laboratory else "single"
+    kind = filming.RIG if cameras else filming.MARKERS if laboratory else filming.SINGLE
     visit = Visit(recordings, solution_of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
     for path in save_visit(visit, out):
         click.echo(path)

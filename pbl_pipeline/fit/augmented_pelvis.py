@@ -19,6 +19,7 @@ from pbl_pipeline.body import PELVIS_TURNS, Body, marker_positions, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MarkerAugmenter
 
+from .joint_terms import arc
 from .problem import Problem
 from .session import Session
 
@@ -90,7 +91,7 @@ def pelvis_of(markers: Float[np.ndarray, "T 35 3"]) -> Float[np.ndarray, "T 3 3"
 
 def inclination_of(pelvis: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 2"]:
     """Tilt (backwards positive) and list (rad) of a pelvis against the vertical, as `joint_terms.inclination`."""
-    return np.arcsin(0.999 * np.stack([pelvis[:, 2, 0], -pelvis[:, 2, 2]], axis=-1))
+    return arc(np.stack([pelvis[:, 2, 0], -pelvis[:, 2, 2]], axis=-1), np)
 
 
 @functools.cache

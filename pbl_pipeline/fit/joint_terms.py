@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -44,8 +46,12 @@ def rises(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
 
 def inclination(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
     """Tilt and list (rad) of a pelvis against the vertical from its three turns."""
-    # Just short of 1, where the derivative of the arc is infinite.
-    return jnp.arcsin(0.999 * rises(pelvis))
+    return arc(rises(pelvis))
+
+
+def arc(sine: Array, xp: Any = jnp) -> Array:
+    """Angle (rad) of a sine, taken just short of 1, where the derivative of the arc is infinite."""
+    return xp.arcsin(0.999 * sine)
 
 
 def posture(qpos: Float[Array, "*n Q"], pelvis: Int[Array, " P"]) -> Float[Array, "*n Q"]:

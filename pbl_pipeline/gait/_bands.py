@@ -15,6 +15,7 @@ from pbl_pipeline.results.cycles import BODY_ANGLES, GaitCycle
 from pbl_pipeline.results.events import SIDES
 from pbl_pipeline.shipped import shipped_text
 
+from ._cycles import REPORT_PERCENT
 from .cycle_measures import Measure
 from .normative import GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
 
@@ -112,8 +113,7 @@ def normal_bands(
             wanted, matched = float(make_interp_spline(norm.cadence, norm.speed, k=1)(steps)), "cadence"
     low, high = float(norm.speed[0]), float(norm.speed[-1])
     at = float(np.clip(wanted, low, high))
-    percent = np.linspace(0.0, 100.0, 51)
-    phase = 2 * np.pi * percent / 100.0
+    phase = 2 * np.pi * REPORT_PERCENT / 100.0
     curves = {
         angle: (
             norm.curve(angle, phase, at) + offset_deg(angle, PLUG_IN_GAIT, angle_model),
@@ -121,7 +121,7 @@ def normal_bands(
         )
         for angle in norm.angles
     }
-    return NormalBands(percent, curves, at, matched, not low <= wanted <= high, norm.source, norm.licence)
+    return NormalBands(REPORT_PERCENT, curves, at, matched, not low <= wanted <= high, norm.source, norm.licence)
 
 
 #: Columns of `curve_frame`; angles in degrees, `percent` of the cycle.

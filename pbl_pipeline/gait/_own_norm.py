@@ -12,6 +12,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check, warn_if
 from pbl_pipeline.results.cycles import GaitCycle
 
+from ._cycles import REPORT_PERCENT
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
 from .types import feature_vector
@@ -60,8 +61,7 @@ def norm_from_cycles(
         raise _invalid(f"cycles whose angles are defined in several ways ({', '.join(sorted(models))})", "one way")
     if len(known) < MIN_VECTORS:
         raise _invalid(f"{len(known)} usable cycles of {len(cycles)}", f"at least {MIN_VECTORS}")
-    percent = np.linspace(0.0, 100.0, 51)
-    at = percent if variables == NINE_ANGLES else percent[:-1]
+    at = REPORT_PERCENT if variables == NINE_ANGLES else REPORT_PERCENT[:-1]
     counts = Counter(p for _, p in known)
     model = models.pop()
     norm = fit_norm(
@@ -74,7 +74,7 @@ def norm_from_cycles(
         licence=licence,
         convention=f"{len(known)} gait cycles of {len(counts)} people, angles of {model}, degrees"
         + (f"; components of these and {len(others)} cycles of patients" if others else ""),
-        curves=_bands([c for c, _ in known], percent),
+        curves=_bands([c for c, _ in known], REPORT_PERCENT),
         variance=variance,
         n_components=n_components,
         pooled=np.array([feature_vector(c.curves, variables, at) for c in others]) if others else None,

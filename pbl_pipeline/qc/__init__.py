@@ -5,6 +5,7 @@ from ._check import (
     EMPTY,
     FAIL,
     NEEDS_CHOICE,
+    OUTCOME_TYPE,
     OUTCOMES,
     PASS,
     WARN,

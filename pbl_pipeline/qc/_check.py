@@ -9,6 +9,8 @@ from pbl_pipeline.records import column, record
 PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
 OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
+#: Type of a column that holds one.
+OUTCOME_TYPE = f"enum({', '.join(map(repr, OUTCOMES))})"
 #: Name of the check that leaves out all cycles of a recording until a person accepts it, although it failed.
 CADENCE = "cadence_plausible"
 
@@ -18,7 +20,7 @@ class Check:
     """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 
     check: str = column("{}_check", "name, with its unit", "varchar(64)", key=True)
-    outcome: str = column("{}_check_outcome", type=f"enum({', '.join(map(repr, OUTCOMES))})")
+    outcome: str = column("{}_check_outcome", type=OUTCOME_TYPE)
     value: float | None = column("{}_check_value", "in the unit (see {}_check)")
     threshold: float | None = column("{}_check_threshold", "in the unit (see {}_check)")
     advice: str = column("{}_check_advice", "what to do about it", "varchar(1000)", cut=True, default="")

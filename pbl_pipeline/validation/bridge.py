@@ -17,7 +17,7 @@ from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, MEASURES, GaitParams, 
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Visit, save_visit, solution_of
-from pbl_pipeline.visit.files import file_of_visit
+from pbl_pipeline.visit.files import METRICS, file_of_visit
 
 from .write import Cell, Table
 
@@ -86,10 +86,10 @@ def folder_values(folder: Path) -> pd.DataFrame:
     """Return the index and the means of the measures of each visit in or below a folder, as `subject` (empty),
     `visit` (its folder), `measure`, `value`.
 
-    Raises `PblError` FILE_MISSING without a `metrics.json`, FILE_FORMAT for one that cannot be read.
+    Raises `PblError` FILE_MISSING without a `METRICS`, FILE_FORMAT for one that cannot be read.
     """
     rows = []
-    for path in sorted(folder.rglob("metrics.json")):
+    for path in sorted(folder.rglob(METRICS)):
         name = path.parent.relative_to(folder).as_posix()
         with file_of_visit(path):
             session = read_json(path)["session"]
@@ -98,7 +98,7 @@ def folder_values(folder: Path) -> pd.DataFrame:
     if not rows:
         raise PblError(
             "FILE_MISSING",
-            found="no metrics.json with measures",
+            found=f"no {METRICS} with measures",
             expected="a folder of visits as `pbl run` or `pbl validate bridge --keep` writes it",
             next_step="name such a folder, or a method",
             key=str(folder),

@@ -16,6 +16,7 @@ from pbl_pipeline.body import SCALE_NAMES, MarkerSet
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
+from pbl_pipeline.filming import SINGLE
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.angles_file import write_angles_csv
 from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
@@ -139,7 +140,7 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
             subject=str(told.get("subject", "-")),
             label=str(told.get("label", "")),
             date=str(told.get("date", "")),
-            kind=str(told.get("kind", "single")),
+            kind=str(told.get("kind", SINGLE)),
             methods={str(k): str(v) for k, v in told.get("methods", {}).items()},
             lacks=(*(ended or old), *(f"no {p.name}: {_AGAIN}" for p in wanted if not p.is_file())),
         )

@@ -13,7 +13,7 @@ import numpy as np
 from pbl_pipeline.body import MarkerSet
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.filming import Filming, height_word, known, picture_class, views_of
+from pbl_pipeline.filming import SINGLE, Filming, height_word, known, picture_class, views_of
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, TrialMetrics, far_leg_of
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
@@ -118,7 +118,7 @@ class Visit:
     subject: str = "-"  # code of the person, never a name
     label: str = ""  # of the visit
     date: str = ""  # of the visit, YYYY-MM-DD; empty where unknown
-    kind: str = "single"  # "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's)
+    kind: str = SINGLE  # of `filming.KINDS`
     #: Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
     #: Missing files and facts, in sentences: of an older version, or of an interrupted run.
@@ -167,11 +167,11 @@ class Visit:
         measured = [r for r in self.fitted if r.measured is not None and r.measured.pooled]
         pooled = [r for r in measured if any(c.used for c in r.cycles)]
         fits = [r.fit for r in pooled if r.fit is not None]
-        one_camera = self.kind == "single"
+        one_camera = self.kind == SINGLE
         return Filming(
             views=views_of((r.name, c.far_leg) for r in pooled for c in r.cycles if c.used) if one_camera else (),
             paces=known(r.condition.pool for r in pooled),
-            height=known("depths" if f.with_depths else height_word(f.height_m) for f in fits),
+            height=known(height_word(f.height_m, f.with_depths) for f in fits),
             cameras=known(f.camera.kind for f in fits) if one_camera else (),
             pictures=known(picture_class(*f.image_size_px) for f in fits) if one_camera else (),
             far_leg=far_leg_of([c for r in pooled for c in r.cycles]),

@@ -14,6 +14,7 @@ import numpy as np
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
+from pbl_pipeline.qc import OUTCOME_TYPE
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
 from pbl_pipeline.results.fits import DepthFit, Residuals, SensorFit, Solution, TrialFigures
@@ -69,7 +70,7 @@ class SessionFit(dj.Computed):
     -> BodyModel
     {definition(Solution, only=("solver", "loss"))}
     {definition(Residuals, "fit")}
-    fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
+    fit_outcome          : {OUTCOME_TYPE}  # worst check
     {definition(Solution, only=("iterations", "converged", "result", "scale"))}
     fit_height=null      : float64             # (m) body height of the person that the fit was told, null: not known
     {definition(Solution, only=("compile_seconds", "device"))}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline import methods
+from pbl_pipeline.filming import KINDS, MARKERS, RIG, SINGLE  # noqa: F401  of `fit`
 from pbl_pipeline.records import number
 
 from . import keypoints, session, video
@@ -25,12 +26,8 @@ schema = dj.Schema()
 
 #: Stands for the methods before the fit if laboratory markers are fitted.
 LABORATORY = "laboratory markers"
-#: Kinds of sets, which are never fitted, pooled or averaged with one another: videos of one camera each, trials of
-#: several calibrated cameras, marker recordings.
-SINGLE, RIG, MARKERS = "single", "rig", "markers"
-KINDS = (SINGLE, RIG, MARKERS)
 #: Type of a column that holds a kind.
-KIND_TYPE = "enum('single', 'rig', 'markers')"
+KIND_TYPE = f"enum({', '.join(map(repr, KINDS))})"
 
 
 @schema

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from pbl_pipeline.names import shortened
+from pbl_pipeline.qc import OUTCOME_TYPE
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import from_row
 
@@ -36,21 +37,21 @@ class SessionQc(dj.Computed):
     -> gdi.SessionGdi
     ---
     -> session.Session
-    qc_outcome : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+    qc_outcome : {OUTCOME_TYPE}
     qc_n       : int16                         # how many checks
     qc_worst   : varchar(1000)                 # names of the checks with that outcome, empty for PASS
     {origin_columns("qc")}
     """
 
     class Check(dj.Part):
-        definition = """
+        definition = f"""
         -> master
         qc_no             : int16              # from 1, in the order of the chain
         ---
         qc_stage          : varchar(16)        # part of the chain
         qc_video_id=null  : int32              # trial it is about, null for the session
         qc_check          : varchar(64)        # name, with its unit
-        qc_check_outcome  : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+        qc_check_outcome  : {OUTCOME_TYPE}
         qc_value=null     : float64            # in the unit (see qc_check)
         qc_threshold=null : float64            # in the unit (see qc_check)
         qc_advice         : varchar(1000)      # what to do about it

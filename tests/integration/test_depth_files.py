@@ -18,6 +18,7 @@ from pbl_pipeline.visit.files import visit_facts
 from pbl_schemas import fit, load_visit, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest, registration
 from pbl_schemas.job_errors import stored_error
+from pbl_schemas.reading.visit_list import results_of
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
 from research.walker.depths import depth_recording
@@ -59,8 +60,12 @@ def test_a_depth_recording_is_part_of_the_fit_of_its_visit(tmp_path: Path):
     found = fit.SessionFit.Depth.fetch1()
     assert (found["depths_used"], found["depths_distance"], found["depths_metre"]) == (0.6, 0.93, 3.0)
     # The visit names it as `pbl run` does.
-    depths = visit_facts(load_visit({"subject": "P001"}))["depths"]
+    visit = load_visit({"subject": "P001"})
+    depths = visit_facts(visit)["depths"]
     assert {name: (d["name"], d["sha256"]) for name, d in depths.items()} == {"a": ("depth", sha256)}
+    (filmed,) = (r.filming for of in results_of([1]).values() for r in of)
+    assert filmed == visit.filming
+    assert visit.filming.height == ("depths",)
     # The same again changes nothing, another scale and another video do.
     assert "nothing was inserted" in ingested(one, "--depth", given)
     assert len(fit.SessionFit()) == 1

@@ -95,7 +95,7 @@ def test_words_of_what_is_stated():
     cane = dataclasses.replace(FROM_LEFT, aid=("cane",))
     assert [str(d) for d in differences(cane, none)] == ["aid (cane, before: none)"]
     assert [str(d) for d in differences(cane, unknown)] == ["aid (cane, before: not stated)"]
-    assert [height_word(h) for h in (None, math.nan, 1.7)] == ["not_stated", "not_stated", "stated"]
+    assert [height_word(h, False) for h in (None, math.nan, 1.7)] == ["not_stated", "not_stated", "stated"]
     sizes = [(1920, 1080), (1080, 1920), (1728, 972), (960, 540), (1280, 720), (3840, 2160), (0, 0)]
     assert [picture_class(*s) for s in sizes] == ["1080p", "1080p", "1080p", "480p", "720p", "2160p", ""]
 

@@ -15,6 +15,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from pbl_pipeline.errors import CODES, MACHINE, PblError, joined
+from pbl_pipeline.files import VIDEO_ENDINGS
 from pbl_pipeline.sensors import SEGMENTS, Given, read_given
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import queue_visit, record
@@ -24,7 +25,7 @@ from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 from pbl_schemas.operations.folders import private_folder, remove_empty
 
-from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, register_copies, samples_of
+from .incoming import Copy, check_log, check_opens, keep_free, register_copies, samples_of
 from .log import event
 
 log = logging.getLogger("pbl.web")

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import pymysql
 
 from pbl_pipeline.errors import CODES, MACHINE, PblError
-from pbl_pipeline.files import sha256_of
+from pbl_pipeline.files import VIDEO_ENDINGS, sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
 from pbl_pipeline.sensors import read_samples
@@ -58,8 +58,6 @@ if TYPE_CHECKING:
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0
-#: Endings of recordings; files that are neither recordings nor logs are ignored and named.
-VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
 #: Time after which a run begins no further upload, and that after which it gives up copying one (s).
 RUN_S, UPLOAD_S = 600.0, 600.0
 #: Limits for reading a sensor log (s, bytes).

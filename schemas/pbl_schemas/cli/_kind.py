@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import click
 
-#: The kinds are `pbl_schemas.fit.KINDS`, which is not imported for the help.
+from pbl_pipeline.filming import KINDS
+
 kind_option = click.option(
     "--kind",
     "fit_set_kind",
-    type=click.Choice(["single", "rig", "markers"]),
+    type=click.Choice(KINDS),
     help="Videos of one camera, trials of several, or markers, where the tables hold several.",
 )

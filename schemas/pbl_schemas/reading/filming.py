@@ -34,8 +34,9 @@ def _filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
         cycles[row["fit_set"], row["fit_method"], row["gait_method"]].append(
             (int(row["video_id"]), row["cycle_far_leg"] or "")
         )
+    deep = {(r["fit_set"], r["fit_method"]) for r in (fit.SessionFit.Depth & sets).proj().to_dicts()}
     heights = {
-        (r["fit_set"], r["fit_method"]): number(r["fit_height"])
+        (key := (r["fit_set"], r["fit_method"])): height_word(number(r["fit_height"]), key in deep)
         for r in (fit.SessionFit & sets).proj("fit_height").to_dicts()
     }
     filmed = fit.FitSet.Video * keypoints.Keypoints.proj("camera_kind") * video.VideoInfo.proj("width", "height")
@@ -58,7 +59,7 @@ def _filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
                 aid=stated("aid", visit["assistive_device"]),
                 orthosis=stated("orthosis", visit["orthosis"]),
                 paces=known(done[v].pool for v in counted),
-                height=(height_word(heights[r["fit_set"], r["fit_method"]]),),
+                height=known(heights[r["fit_set"], r["fit_method"]] for _ in counted),
                 cameras=known(v["camera_kind"] for v in about),
                 pictures=known(picture_class(v["width"], v["height"]) for v in about),
                 far_leg=mostly(np.array([far for _, far in own])),

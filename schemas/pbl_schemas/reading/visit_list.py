@@ -16,6 +16,7 @@ from typing import Any
 
 from pbl_pipeline.change import Result, change_since
 from pbl_pipeline.filming import Difference
+from pbl_pipeline.qc import OUTCOMES as CHECK_OUTCOMES
 from pbl_pipeline.records import names, number
 from pbl_pipeline.results.index import WITH_ERROR, Gdi
 
@@ -36,7 +37,7 @@ STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable", "unre
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
-OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL", "ACCEPTED")
+OUTCOMES = (*CHECK_OUTCOMES, "ACCEPTED")
 #: Checks (q) of measures (g).
 _WITH_ERROR = names(Gdi, "session_gdi", only=WITH_ERROR)
 _RESULT = ("fit_set", "fit_method", "gait_method", "gdi_method", "norm")

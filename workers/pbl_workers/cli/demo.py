@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from pbl_pipeline.cli.command_line import EXIT_INTERRUPTED
 from pbl_pipeline.cli.options import LANGUAGE
 from pbl_pipeline.errors import PblError
 
@@ -91,7 +92,7 @@ def _populated() -> None:
     run = populate()
     click.echo("\n".join(summary(run)))
     if run.interrupted:
-        raise click.exceptions.Exit(130)
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
     _step(5, "result")
 
 

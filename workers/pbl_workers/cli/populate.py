@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pbl_pipeline.cli.command_line import EXIT_INTERRUPTED
+
 if TYPE_CHECKING:
     from pbl_workers.populate import Run
 
@@ -33,7 +35,7 @@ def populate(tables: tuple[str, ...], limit: int | None, retry_errors: bool, vis
     for line in summary(run):
         click.echo(line)
     if run.interrupted:
-        raise click.exceptions.Exit(130)
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
 def summary(run: Run) -> list[str]:

@@ -14,6 +14,7 @@ from starlette.responses import FileResponse, Response
 from pbl_pipeline import settings
 from pbl_pipeline.change import result_of
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import VIDEO_ENDINGS
 from pbl_pipeline.visit import FIT, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
 from pbl_schemas.reading.shown import Pooled, ShownCheck, ShownRecording, ShownVisit, video_facts
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 _MOST, _DEEP = 1000, 3
 #: Visits that are kept in memory at a time.
 _KEPT = 4
-#: Endings of recordings that are searched beside their results.
-_VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +124,7 @@ class ResultsFolder(Source):
                 f"PBL_DEIDENTIFY={how}: the recording is not shown",
                 "look at the video with the body drawn in, which `pbl run` made of a copy with hidden heads",
             )
-        wanted = {f"{name}{end}".lower() for end in _VIDEOS}
+        wanted = {f"{name}{end}".lower() for end in VIDEO_ENDINGS}
         for folder in (self._videos,) if self._videos else (results, results.parent):
             for file in sorted(folder.iterdir()) if folder.is_dir() else ():
                 if file.name.lower() in wanted and file.is_file():

@@ -14,6 +14,7 @@ from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.files import VIDEO_ENDINGS
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.sensors import SEGMENTS
 from pbl_pipeline.words import capital
@@ -26,7 +27,7 @@ from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
 from ..browser_uploads import Arriving, Place, Received
-from ..incoming import VIDEO_ENDINGS, Copy, check_room
+from ..incoming import Copy, check_room
 from . import pages, site
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
