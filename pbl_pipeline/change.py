@@ -241,9 +241,8 @@ def visit_changes(visit: Visit, before: Visit) -> list[dict[str, Any]]:
         raise _not_earlier("USAGE", f"other methods: {'; '.join(pairs)}", before.title, again)
     now, then = (dataclasses.replace(r, filming=v.filming) for r, v in ((now, visit), (then, before)))
     measures, old = (v.measures.spatiotemporal.measures for v in (visit, before) if v.measures is not None)
-    index = change_since(now, then)
-    changes = {} if index is None else {INDEX: index}
-    return [c.row(name) for name, c in (changes | measure_changes(measures, old, not_alike(now, then))).items()]
+    changes = {n: change_of(n, now, then, measures.get(n), old.get(n)) for n in (INDEX, *measures)}
+    return [c.row(name) for name, c in changes.items() if c is not None]
 
 
 def _not_earlier(code: str, found: str, key: object, next_step: str = "name the folder of an earlier run") -> PblError:

@@ -79,17 +79,15 @@ def _changes(found: Any) -> list[dict[str, Any]]:
 
     out: list[dict[str, Any]] = []
     for _, own in found.groupby("subject", sort=False):
-        earlier: list[tuple[dict, Result]] = []
-        for now in own.to_dict("records"):
-            with_result = [(now, r) for r in results[now["session_id"]]]
-            for _, result in with_result:
+        visits = own.to_dict("records")
+        for at, now in enumerate(visits):
+            earlier = [(v, r) for v in visits[:at] for r in results[v["session_id"]]]
+            for result in results[now["session_id"]]:
                 for name, mine in known(now, result).items():
                     last = visit_before(result, [one for one in earlier if name in known(*one)])
                     if last and (change := change_of(name, result, last[1], mine, known(*last)[name])):
                         labels = {"visit": now["session_label"], "before": last[0]["session_label"]}
-                        row = {"subject": now["subject"], **labels, **change.row(name), "fit": result.methods[0]}
-                        out.append(row)
-            earlier += with_result
+                        out.append({"subject": now["subject"], **labels, **change.row(name), "fit": result.methods[0]})
     return out
 
 

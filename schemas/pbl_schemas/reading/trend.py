@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.change import INDEX, Change, Result, change_of, usual_chain, visit_before
 from pbl_pipeline.errors import PblError
@@ -31,11 +31,11 @@ class Point:
     label: str
     day: datetime.date | None
     role: str
-    value: float | None
-    bounds: tuple[float, float] | None
-    left: float | None
-    right: float | None
-    reason: str
+    value: float | None = None
+    bounds: tuple[float, float] | None = None
+    left: float | None = None
+    right: float | None = None
+    reason: str = ""
     error: float | None = None
     least: float | None = None
     before: Change | None = None
@@ -97,19 +97,12 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
     return Trend(subject, measure, known, usual or (), tuple(points), tuple(left_out))
 
 
-def _value(measure: str, result: Result, found: Measure | None, reason: str) -> dict:
+def _value(measure: str, result: Result, found: Measure | None, reason: str) -> dict[str, Any]:
     from pbl_pipeline.gait import interval_90
 
     if measure == INDEX:
-        bounds = interval_90(result.index, result.sd)
-        return {"value": result.index, "bounds": bounds, "left": None, "right": None, "reason": result.reason}
+        return {"value": result.index, "bounds": interval_90(result.index, result.sd), "reason": result.reason}
     if found is None:
-        return {"value": None, "bounds": None, "left": None, "right": None, "reason": reason}
-    return {
-        "value": found.mean,
-        "bounds": found.interval,
-        "left": found.left,
-        "right": found.right,
-        "reason": "",
-        **dict(zip(("error", "least"), found.errors, strict=True)),
-    }
+        return {"reason": reason}
+    sides = {"left": found.left, "right": found.right}
+    return {"value": found.mean, "bounds": found.interval, **sides, "error": found.errors[0], "least": found.errors[1]}

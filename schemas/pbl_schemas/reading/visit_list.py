@@ -421,10 +421,9 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         people,
     )
     results = results_of(int(s) for s, *_ in others)
-    indexed: dict[str, list[tuple[Sequence[Any], Result]]] = {}
-    for *visit, subject in others:
-        with_index = ((visit, r) for r in results[int(visit[0])] if r.index is not None)
-        indexed.setdefault(str(subject), []).extend(with_index)
+    indexed: dict[str, list[tuple[Any, Result]]] = {str(r[1]): [] for r in rows}
+    for i, day, label, subject in others:
+        indexed[str(subject)] += [((int(i), day, str(label)), r) for r in results[int(i)] if r.index is not None]
     listed = _places(ids)
     counted = (
         f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed}) GROUP BY session_id"
@@ -467,16 +466,15 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     return tuple(out)
 
 
-def _trend(session_id: int, result: Result | None, indexed: Sequence[tuple[Sequence[Any], Result]]) -> Trend | None:
+def _trend(session_id: int, result: Result | None, indexed: Sequence[tuple[Any, Result]]) -> Trend | None:
     """`indexed`: number, day and label of the person's visits, in their order, with each result that has an index."""
     if result is None or result.index is None:
         return None
     at = next(i for i, (visit, _) in enumerate(indexed) if visit[0] == session_id)
-    if (last := visit_before(result, indexed[:at])) is None:
+    if (last := visit_before(result, indexed[:at])) is None or (change := change_since(result, last[1])) is None:
         return None
-    (number, day, label), before = last
-    change = change_since(result, before)
-    return change and Trend(number, day, label, change.by, change.sure, change.least, change.differs)
+    number, day, label = last[0]
+    return Trend(number, day, label, change.by, change.sure, change.least, change.differs)
 
 
 # --------------------------------------------------------------------------------------------------------------- SQL
