@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import VIEW, Difference, Filming, differences
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.gait import Measure
     from pbl_pipeline.visit import Visit
 
+_V = TypeVar("_V")
 #: Name of the index among the measures.
 INDEX = "gdi"
 #: Difference of two stated body heights (m) from which on two visits without codes are taken for two people.
@@ -92,6 +93,13 @@ class Change:
         }
 
 
+def visit_before(result: Result, earlier: Sequence[tuple[_V, Result]]) -> tuple[_V, Result] | None:
+    """Return the visit before one with `result`: the last with a result by the same chain of methods. `earlier`: those
+    of the person whose result has the value, in the order of their days, of one day in that of their numbers; those
+    without a day come first."""
+    return next((one for one in reversed(earlier) if one[1].chain == result.chain), None)
+
+
 def change_since(result: Result, before: Result) -> Change | None:
     """The change of the index from one result to another; None if one of them has no index.
 
@@ -104,6 +112,13 @@ def change_since(result: Result, before: Result) -> Change | None:
         return None
     errors = [r.errors for r in (result, before)]
     return judged(result.index - before.index, errors, not_alike(result, before), IMPORTANT_CHANGE)
+
+
+def change_of(name: str, result: Result, before: Result, mine: Measure | None, old: Measure | None) -> Change | None:
+    """Return the change of the index (`INDEX`), or of a measure that two results have."""
+    if name == INDEX:
+        return change_since(result, before)
+    return measure_changes({name: mine}, {name: old}, not_alike(result, before)).get(name)
 
 
 def measure_changes(
@@ -226,9 +241,8 @@ def visit_changes(visit: Visit, before: Visit) -> list[dict[str, Any]]:
         raise _not_earlier("USAGE", f"other methods: {'; '.join(pairs)}", before.title, again)
     now, then = (dataclasses.replace(r, filming=v.filming) for r, v in ((now, visit), (then, before)))
     measures, old = (v.measures.spatiotemporal.measures for v in (visit, before) if v.measures is not None)
-    index = change_since(now, then)
-    changes = {} if index is None else {INDEX: index}
-    return [c.row(name) for name, c in (changes | measure_changes(measures, old, not_alike(now, then))).items()]
+    changes = {n: change_of(n, now, then, measures.get(n), old.get(n)) for n in (INDEX, *measures)}
+    return [c.row(name) for name, c in changes.items() if c is not None]
 
 
 def _not_earlier(code: str, found: str, key: object, next_step: str = "name the folder of an earlier run") -> PblError:

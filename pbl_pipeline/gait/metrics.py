@@ -14,7 +14,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 from pbl_pipeline.records import plain, record
-from pbl_pipeline.results.cycles import GaitCycle
+from pbl_pipeline.results.cycles import Curves, GaitCycle
 from pbl_pipeline.results.events import GaitEvents
 from pbl_pipeline.results.index import SessionMetrics
 from pbl_pipeline.results.measures import OF_VISIT, Z90, minimal_change_of
@@ -95,9 +95,8 @@ class TrialMetrics(TrialCycles):
 
     def to_dict(self) -> dict:
         """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
-        of_files = ("trial", "curves", "curves_sd", "error_model")
         events = {k: v for k, v in vars(self.events).items() if k != "events"}
-        cycles = [{k: v for k, v in vars(c).items() if k not in of_files} for c in self.cycles]
+        cycles = [{k: v for k, v in vars(c).items() if k not in ("trial", *Curves._fields)} for c in self.cycles]
         more = plain({"pooled": self.pooled, "events": events, "gait_cycles": cycles})
         return {"name": self.name, **_measures(self), **more}
 

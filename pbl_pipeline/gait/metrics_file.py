@@ -5,30 +5,22 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
+from pbl_pipeline.results.cycles import Curves, GaitCycle
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
 from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, numbers_of
 from pbl_pipeline.results.measures import Measure
 
-from ._cycles import REPORT_PERCENT, GaitCycle
+from ._cycles import REPORT_PERCENT
 from .cycle_measures import MEASURES, Spatiotemporal
 from .metrics import GaitMetrics, TrialMetrics
 from .tasks import TRIAL_MEASURES
-
-
-class Curves(NamedTuple):
-    """Fields of a `GaitCycle` in its file: known curves and their standard deviations by name, each (P,) degrees, and
-    the model of their error."""
-
-    curves: dict[str, np.ndarray]
-    curves_sd: dict[str, np.ndarray]
-    error_model: str = ""
 
 
 def curve_table(curves: Sequence[Mapping[str, np.ndarray]], names: Sequence[str]) -> np.ndarray:
@@ -45,15 +37,16 @@ def known_curves(names: Sequence[str], rows: np.ndarray) -> dict[str, np.ndarray
 
 def save_curves(cycles: Sequence[GaitCycle], path: Path) -> None:
     """Write the curves of all cycles and their standard deviations to one .npz (float32); unknown curves are NaN."""
-    names = sorted({name for c in cycles for name in c.curves})
+    curves, curves_sd, error_models = ([getattr(c, field) for c in cycles] for field in Curves._fields)
+    names = sorted({name for of_cycle in curves for name in of_cycle})
     np.savez_compressed(
         path,
         cycle_no=np.asarray([c.number for c in cycles], np.int16),
         names=np.asarray(names, dtype=str),
         percent=np.asarray(REPORT_PERCENT, np.float32),
-        curve=curve_table([c.curves for c in cycles], names),
-        curve_sd=curve_table([c.curves_sd for c in cycles], names),
-        error_model=np.asarray([c.error_model for c in cycles], dtype=str),
+        curve=curve_table(curves, names),
+        curve_sd=curve_table(curves_sd, names),
+        error_model=np.asarray(error_models, dtype=str),
     )
 
 
@@ -147,7 +140,7 @@ def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:
 
 
 def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves]) -> GaitCycle:
-    known = curves.get(int(content["number"]), Curves({}, {}))
+    known = curves.get(int(content["number"]), Curves({}, {}, ""))
     return structured({**content, "trial": trial, **known._asdict()}, GaitCycle)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,6 +64,14 @@ class Exclusion:
         if self.curve_distance_deg is not None:
             reasons.append(f"{self.curve_distance_deg:.0f} deg from the median curves of {self.n_curves} cycles")
         return " and ".join(reasons)
+
+
+class Curves(NamedTuple):
+    """Fields of a `GaitCycle` in its file of curves, not in metrics.json."""
+
+    curves: dict[str, np.ndarray]
+    curves_sd: dict[str, np.ndarray]
+    error_model: str
 
 
 #: Reason why a cycle without a fit has no lengths.

@@ -27,7 +27,7 @@ from .rows import Rows, one, row_of, stored_rows
 from .stored_files import file_ref, read_stored
 
 if TYPE_CHECKING:
-    from pbl_pipeline.gait.metrics_file import Curves
+    from pbl_pipeline.results.cycles import Curves
 
 schema = dj.Schema()
 

@@ -13,7 +13,7 @@ from datajoint.storage import StorageBackend
 import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from pbl_schemas import connection, lab, session, tracking, video
+from pbl_schemas import connection, lab, session, tracking, video, worker
 from pbl_schemas.datajoint_setup import full_path
 from pbl_schemas.intake import VisitRecord, uploads
 from pbl_schemas.operations.archive import PHONE, folder_of, note_placed
@@ -216,6 +216,9 @@ def test_all_other_jobs_run(tables: None, tmp_path: Path):
         assert said in done.out
     (page,) = (tmp_path / "out").glob("*.html")
     assert "<script" not in page.read_text()
+    with worker.installation_lock("refresh", connection.another()):  # a worker looks
+        done = pbl("cron", "refresh")
+        assert (done.code, done.out) == (0, "another process is doing this now\n")
 
 
 def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp_path: Path):

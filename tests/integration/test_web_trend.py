@@ -1,5 +1,6 @@
 """All visits of a person in time, and the letter of a visit, in the review page."""
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,11 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
-from pbl_schemas import gait, gdi
+from pbl_schemas import fit, gait, gdi, session
 from pbl_schemas.intake.records import set_condition
-from pbl_schemas.reading import comparison
+from pbl_schemas.reading import comparison, registered
 from pbl_schemas.reading.trend import trend_of
+from pbl_schemas.reading.visit_list import visits_of
 from pbl_schemas.studies.visit_forms import enter_scores, scores_form
 from pbl_workers.populate import populate
 from tests import Environment, not_none
@@ -60,6 +62,53 @@ def test_the_index_of_all_visits_with_what_is_more_than_chance(visits: None):
     assert third.before is not None
     assert third.first is not None
     assert (third.before.by, third.before.sure, third.first.by, third.first.sure) == (10.0, True, 15.0, True)
+
+
+def before(session_id: int, measure: str = "gdi") -> tuple[str, float] | None:
+    """The visit before and the change since it in the list of changes, as the trend has it and, of the index, the list
+    of visits."""
+    of_person = {v.session_id: v for v in visits_of("P001")}
+    rows = registered.changes({"subject": "P001"})
+    rows = rows[(rows["visit"] == of_person[session_id].label) & (rows["measure"] == measure)]
+    listed = next(zip(rows["before"], rows["change"], strict=True), None)
+    (point,) = [p for p in trend_of(1, measure).points if p.session_id == session_id]
+    assert (point.before and round(point.before.by, 3)) == (listed and listed[1])
+    if measure == "gdi":
+        trend = of_person[session_id].trend
+        assert (trend and (of_person[trend.session_id].label, trend.change)) == listed
+    return listed
+
+
+def test_the_visit_before_is_one_everywhere(visits: None):
+    def middle(**values: Any) -> None:
+        gdi.SessionGdi.update1({k: key[k] for k in gdi.SessionGdi.primary_key} | values)
+
+    key = comparison.shown_visit(2).key
+    assert before(3) == ("2026-04-10", 10.0)
+    assert before(1) is None
+    one_set = {"fit_set": key["fit_set"]}
+    try:  # the one in the middle was computed by another chain
+        fit.FitSet.update1({**one_set, "fit_set_kind": fit.MARKERS})
+        assert before(3) == ("2026-01-10", 15.0)
+    finally:
+        fit.FitSet.update1({**one_set, "fit_set_kind": fit.SINGLE})
+    try:  # it has no index, and its other measures
+        middle(session_gdi=None)
+        assert before(3) == ("2026-01-10", 15.0)
+        assert not_none(before(3, "stride_time_s"))[0] == "2026-04-10"
+    finally:
+        middle(session_gdi=INDICES[2])
+    for number, day, order in ((2, "2026-07-10", (1, 2, 3)), (1, "2026-07-10", (2, 1, 3)), (3, None, (3, 1, 2))):
+        was = (session.Session & {"session_id": number}).fetch1("session_date")
+        try:  # of one day, in the order in which they were registered; without a day before all others
+            session.Session.update1({"session_id": number, "session_date": day})
+            labels = {v.session_id: v.label for v in visits_of("P001")}
+            assert before(order[0]) is None
+            for earlier, later in itertools.pairwise(order):
+                assert before(later) == (labels[earlier], INDICES[later] - INDICES[earlier])
+            assert "since None" not in web.client().get("/visits").text
+        finally:
+            session.Session.update1({"session_id": number, "session_date": was})
 
 
 def test_a_measure_has_its_spread_and_no_verdict(visits: None):

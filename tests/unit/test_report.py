@@ -10,9 +10,10 @@ import pytest
 from pbl_pipeline.charts import cycle_chart, nice_ticks
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
+from pbl_pipeline.gait import GaitMetrics, far_leg_of, gait_metrics, load_norm, normal_bands
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
+from pbl_pipeline.report.curves import cycle_curves
 from pbl_pipeline.report.words import plural, sentence, size
 from pbl_pipeline.texts import LANGUAGES, catalogue, library_words
 from pbl_pipeline.tracking import SubjectChoice
@@ -262,6 +263,16 @@ def test_fit_without_a_known_frame_is_drawn_without_curves(stand: TrialFit, tmp_
     recording = Recording.of("stand", unknown, video=VIDEO, choice=CHOICE, problem="nobody was seen")
     page = _page(_visit(recording), tmp_path)
     assert "The body is fitted in no frame." in page.text
+
+
+def test_the_leg_that_is_drawn_faint_is_the_one_of_the_sentence(measured: GaitMetrics) -> None:
+    seen = next(c for c in measured.cycles if c.used and c.curves)
+    # One cycle alone has curves, and it was not seen from the side as the others were.
+    others = [dataclasses.replace(seen, far_leg=seen.side, curves={})] * 9
+    cycles = [dataclasses.replace(seen, far_leg=""), *others]
+    assert far_leg_of(cycles) == seen.side
+    (drawn,) = cycle_curves(cycles, normal_bands(None), {"knee_flexion": ("Knee", "flexion")}, lambda title, _: title)
+    assert 'opacity="0.4"' in drawn.picture
 
 
 def test_norm_band_is_the_norm() -> None:

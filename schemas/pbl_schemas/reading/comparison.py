@@ -172,7 +172,7 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
         page = shown_visit(session_id, number)
         if all((p.row.session_id, p.shown) != (session_id, page.shown) for _, p in pages):
             pages.append((one, page))
-    pages.sort(key=lambda p: (p[1].row.day is None, p[1].row.day, p[1].row.session_id))
+    pages.sort(key=lambda p: (p[1].row.day is not None, p[1].row.day, p[1].row.session_id))  # as `visit_before`
     at = next((i for i, (one, _) in enumerate(pages) if one == reference), 0)
     first = pages[at][1]
     ids = {p.row.session_id for _, p in pages}

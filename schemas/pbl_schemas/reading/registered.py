@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.change import INDEX, Change, change_since, measure_changes, not_alike
+from pbl_pipeline.change import INDEX, Change, Result, change_of, visit_before
 from pbl_pipeline.errors import PblError
 
 from .. import fit, gdi, keypoints, lab, review, session, video
@@ -21,6 +20,7 @@ from .visit_list import results_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pbl_pipeline.gait import Measure
 
 #: People whose changes are computed at a time where not all are wanted.
 _PEOPLE = 10
@@ -51,9 +51,9 @@ def visits(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
 
 
 def changes(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
-    """One row per visit with a result by the chain of methods of the visit before of the person, and measure ("gdi":
-    the index): its change, the smallest that is more than chance, and the probabilities that it is real and important;
-    or why the two cannot be compared (docs/measures.md)."""
+    """One row per visit with a visit before (`visit_before`), chain of methods and measure ("gdi": the index): its
+    change, the smallest that is more than chance, and the probabilities that it is real and important; or why the two
+    cannot be compared (docs/measures.md)."""
     import pandas as pd
 
     wanted = _visits() & restriction
@@ -69,32 +69,33 @@ def changes(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
 
 
 def _changes(found: Any) -> list[dict[str, Any]]:
-    """Rows of `changes`. `found`: visits in the order of their people and days."""
+    """Rows of `changes`. `found`: visits in the order of their people and `visit_before`."""
     results = results_of(found["session_id"])
     measures = _measures(found["session_id"])
+
+    def known(visit: dict, result: Result) -> dict[str, Measure | None]:
+        own = measures.get((visit["session_id"], result.kind, *result.methods), {})
+        return own if result.index is None else {INDEX: None, **own}
+
     out: list[dict[str, Any]] = []
     for _, own in found.groupby("subject", sort=False):
-        rows = [r for r in own.to_dict("records") if results[r["session_id"]]]
-        for before, now in itertools.pairwise(rows):
+        visits = own.to_dict("records")
+        for at, now in enumerate(visits):
+            earlier = [(v, r) for v in visits[:at] for r in results[v["session_id"]]]
             for result in results[now["session_id"]]:
-                same = [r for r in results[before["session_id"]] if r.chain == result.chain]
-                if not same:
-                    continue
-                changes = {INDEX: change_since(result, same[0])}
-                mine, old = (measures.get((v["session_id"], result.kind, *result.methods), {}) for v in (now, before))
-                changes |= measure_changes(mine, old, not_alike(result, same[0]))
-                about = {"subject": now["subject"], "visit": now["session_label"], "before": before["session_label"]}
-                out += [
-                    {**about, **c.row(name), "fit": result.methods[0]} for name, c in changes.items() if c is not None
-                ]
+                for name, mine in known(now, result).items():
+                    last = visit_before(result, [one for one in earlier if name in known(*one)])
+                    if last and (change := change_of(name, result, last[1], mine, known(*last)[name])):
+                        labels = {"visit": now["session_label"], "before": last[0]["session_label"]}
+                        out.append({"subject": now["subject"], **labels, **change.row(name), "fit": result.methods[0]})
     return out
 
 
-def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
+def _measures(sessions: Any) -> dict[tuple, dict[str, Measure | None]]:
     """The library's measures of the results of visits, by visit, kind of recordings and methods."""
     chain = ("session_id", "fit_set_kind", *gdi.SessionGdi.primary_key[1:])
     query = gdi.SessionGdi.Measure * newest_sets()
-    out: dict[tuple, dict[str, Any]] = {}
+    out: dict[tuple, dict[str, Measure | None]] = {}
     for row in rows_inside(query, "session_id", map(int, sessions)):
         of_visit = out.setdefault(tuple(row[k] for k in chain), {})
         if (measure := gdi.SessionGdi.Measure.measure(row)) is not None:
@@ -186,7 +187,7 @@ def _videos() -> Any:
 
 def _first(query: Any, most: int | None, *order: str) -> Any:
     """The first rows of a query by these columns, `most` of them (None: all)."""
-    return frame_of(query & dj.Top(most, order)).sort_values(list(order), ignore_index=True)
+    return frame_of(query & dj.Top(most, order)).sort_values(list(order), ignore_index=True, na_position="first")
 
 
 def _counted(rows: Any, key: str, *counts: tuple[Any, dict[str, str]]) -> Any:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+from typing import TYPE_CHECKING, Any
 
-from pbl_pipeline.change import INDEX, Change, Result, change_since, judged, not_alike, usual_chain
+from pbl_pipeline.change import INDEX, Change, Result, change_of, usual_chain, visit_before
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import MEASURES
 
 from .. import session, video
 from .shown import shown_visit
 from .visit_list import results_of, visits_of
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import Measure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,18 +24,18 @@ class Point:
 
     value: None if it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
     least, its minimal detectable change, are known, else of the spread of its cycles or repetitions alone. before: the
-    change since the visit before with a value; first: since the first one.
+    change since the visit before (`visit_before`); first: since the first one with a value.
     """
 
     session_id: int
     label: str
     day: datetime.date | None
     role: str
-    value: float | None
-    bounds: tuple[float, float] | None
-    left: float | None
-    right: float | None
-    reason: str
+    value: float | None = None
+    bounds: tuple[float, float] | None = None
+    left: float | None = None
+    right: float | None = None
+    reason: str = ""
     error: float | None = None
     least: float | None = None
     before: Change | None = None
@@ -69,52 +73,36 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
             expected=f"a measure: {', '.join(known)}",
             next_step="choose one on the page",
         )
-    rows = sorted(visits_of(subject), key=lambda v: (v.day or datetime.date.min, v.session_id))
+    rows = visits_of(subject)[::-1]
     results = results_of(v.session_id for v in rows)
     usual = usual_chain(results)
     points: list[Point] = []
-    with_value: list[tuple[Point, Result]] = []
+    with_value: list[tuple[Measure | None, Result]] = []
     left_out: list[str] = []
     for v in rows:
         at = next((i for i, r in enumerate(results[v.session_id]) if r.chain == usual), None)
         if at is None:
             left_out.append(v.label)
             continue
-        result = results[v.session_id][at]
-        named = {"session_id": v.session_id, "label": v.label, "day": v.day, "role": v.role}
-        point = Point(**named, **_value(v.session_id, at, result, measure))
+        result, found, reason = results[v.session_id][at], None, ""
+        if measure != INDEX:
+            found, reason = shown_visit(v.session_id, at).all_measures.get(measure, (None, ""))
+        point = Point(v.session_id, v.label, v.day, v.role, **_value(measure, result, found, reason))
         if point.value is not None:
-            if with_value:
-                since = [_change(measure, point, result, *earlier) for earlier in (with_value[-1], with_value[0])]
+            if (last := visit_before(result, with_value)) is not None:
+                since = [change_of(measure, result, r, found, old) for old, r in (last, with_value[0])]
                 point = dataclasses.replace(point, before=since[0], first=since[1])
-            with_value.append((point, result))
+            with_value.append((found, result))
         points.append(point)
     return Trend(subject, measure, known, usual or (), tuple(points), tuple(left_out))
 
 
-def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
+def _value(measure: str, result: Result, found: Measure | None, reason: str) -> dict[str, Any]:
     from pbl_pipeline.gait import interval_90
 
     if measure == INDEX:
-        bounds = interval_90(result.index, result.sd)
-        return {"value": result.index, "bounds": bounds, "left": None, "right": None, "reason": result.reason}
-    found, reason = shown_visit(session_id, at).all_measures.get(measure, (None, ""))
+        return {"value": result.index, "bounds": interval_90(result.index, result.sd), "reason": result.reason}
     if found is None:
-        return {"value": None, "bounds": None, "left": None, "right": None, "reason": reason}
-    return {
-        "value": found.mean,
-        "bounds": found.interval,
-        "left": found.left,
-        "right": found.right,
-        "reason": "",
-        **dict(zip(("error", "least"), found.errors, strict=True)),
-    }
-
-
-def _change(measure: str, point: Point, result: Result, earlier: Point, before: Result) -> Change | None:
-    if measure == INDEX:
-        return change_since(result, before)
-    assert point.value is not None
-    assert earlier.value is not None
-    errors = [(p.error, p.least) for p in (point, earlier)]
-    return judged(point.value - earlier.value, errors, not_alike(result, before))
+        return {"reason": reason}
+    sides = {"left": found.left, "right": found.right}
+    return {"value": found.mean, "bounds": found.interval, **sides, "error": found.errors[0], "least": found.errors[1]}

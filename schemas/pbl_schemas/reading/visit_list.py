@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pbl_pipeline.change import Result, change_since
+from pbl_pipeline.change import Result, change_since, visit_before
 from pbl_pipeline.filming import Difference
 from pbl_pipeline.qc import OUTCOMES as CHECK_OUTCOMES
 from pbl_pipeline.records import names, number
@@ -64,11 +64,11 @@ class Filter:
 
 @dataclasses.dataclass(frozen=True)
 class Trend:
-    """Change of the index against the visit before of the same person, by the same chain of methods; sure, least and
-    differs as in `Change`."""
+    """Change of the index against the visit before (`visit_before`); sure, least and differs as in `Change`."""
 
     session_id: int
     day: datetime.date | None
+    label: str
     change: float
     sure: bool | None
     least: float | None = None
@@ -417,14 +417,14 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         return ()
     people = sorted({str(r[1]) for r in rows})
     others = _ask(
-        f"SELECT session_id, subject, session_date FROM {_name(session.Session)} WHERE subject IN ({_places(people)})",
+        f"SELECT session_id, session_date, session_label, subject FROM {_name(session.Session)}"
+        f" WHERE subject IN ({_places(people)}) ORDER BY session_date, session_id",
         people,
     )
-    results = results_of(int(s) for s, _, _ in others)
-    of_person: dict[str, list[tuple[datetime.date, int]]] = {}
-    for session_id, subject, day in others:
-        if day is not None:
-            of_person.setdefault(str(subject), []).append((day, int(session_id)))
+    results = results_of(int(s) for s, *_ in others)
+    indexed: dict[str, list[tuple[Any, Result]]] = {str(r[1]): [] for r in rows}
+    for i, day, label, subject in others:
+        indexed[str(subject)] += [((int(i), day, str(label)), r) for r in results[int(i)] if r.index is not None]
     listed = _places(ids)
     counted = (
         f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed}) GROUP BY session_id"
@@ -461,29 +461,21 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
                 problem=failed.get(i, ""),
                 result=first,
                 more=max(0, len(found) - 1),
-                trend=_trend(first, day, of_person.get(str(subject), []), results),
+                trend=_trend(i, first, indexed[str(subject)]),
             )
         )
     return tuple(out)
 
 
-def _trend(
-    result: Result | None,
-    day: datetime.date | None,
-    of_person: Sequence[tuple[datetime.date, int]],
-    results: Mapping[int, Sequence[Result]],
-) -> Trend | None:
-    if result is None or result.index is None or day is None:
+def _trend(session_id: int, result: Result | None, indexed: Sequence[tuple[Any, Result]]) -> Trend | None:
+    """`indexed`: number, day and label of the person's visits, in their order, with each result that has an index."""
+    if result is None or result.index is None:
         return None
-    for before, session_id in sorted(of_person, reverse=True):
-        if before >= day:
-            continue
-        for other in results[session_id]:
-            if other.chain == result.chain:
-                change = change_since(result, other)
-                if change is not None:
-                    return Trend(session_id, before, change.by, change.sure, change.least, change.differs)
-    return None
+    at = next(i for i, (visit, _) in enumerate(indexed) if visit[0] == session_id)
+    if (last := visit_before(result, indexed[:at])) is None or (change := change_since(result, last[1])) is None:
+        return None
+    number, day, label = last[0]
+    return Trend(number, day, label, change.by, change.sure, change.least, change.differs)
 
 
 # --------------------------------------------------------------------------------------------------------------- SQL

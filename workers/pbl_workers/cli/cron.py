@@ -13,8 +13,10 @@ from pbl_pipeline.errors import PblError, harmless
 AT_MOST_S = 1800
 #: How many names of ignored files `pbl cron import` prints.
 _MOST_IGNORED = 100
-#: Exit status where another process does the work now: neither a success nor a failure.
+#: Exit status where another process does the work now: neither a success nor a failure. `refresh` then ends with 0: an
+#: idle worker does the same, and often.
 BUSY = 75
+_BUSY = "another process is doing this now"
 
 
 class _Pass(click.Command):
@@ -31,12 +33,17 @@ class _Cron(click.Group):
     command_class = _Pass
 
 
-@click.group(cls=_Cron)
-def cron() -> None:
-    """Regular jobs; each may run at any time, also twice. docs/deployment.md has a crontab and systemd timers.
+@click.group(
+    cls=_Cron,
+    help=f"""Regular jobs; each may run at any time, also twice. docs/deployment.md has a crontab and systemd timers.
+
+    Exit code {BUSY} of import and backup: {_BUSY}.
 
     Example: pbl cron import && pbl cron refresh
-    """
+    """,
+)
+def cron() -> None:
+    pass
 
 
 @cron.command("import")
@@ -45,8 +52,8 @@ def cron() -> None:
 def import_(settled_s: float) -> None:
     """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
 
-    Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now. After
-    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run continues.
+    Exit code 1 when an upload was refused or could not be taken. After 30 minutes the process is ended by SIGALRM,
+    whatever it waits for; the next run continues.
 
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
@@ -94,7 +101,7 @@ def refresh(everything: bool) -> None:
     pbl_schemas.activate()
     found = look(everything or None)
     if found is None:
-        click.echo("another process is doing this now")
+        click.echo(_BUSY)
         return
     queued = ", ".join(f"{n} of {name}" for name, n in found.queued.items()) or "nothing"
     click.echo(f"queued: {queued}; {found.planned} fits planned, {found.freed} freed, {found.swept} obsolete")
@@ -144,8 +151,6 @@ def reprocess() -> None:
 def backup(keep: int) -> None:
     """Save database, store and recordings into a new folder of PBL_BACKUP, and remove the oldest.
 
-    Exit code 75 when another process does so now.
-
     A person who was forgotten is also gone from the backups once the last older one is removed.
 
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
@@ -157,7 +162,7 @@ def backup(keep: int) -> None:
     pbl_schemas.activate(methods=False)
     made = backup_regularly(backup_folder(), keep, click.echo)
     if made is None:
-        click.echo("another process is doing this now", err=True)
+        click.echo(_BUSY, err=True)
         raise click.exceptions.Exit(BUSY)
     say(made)
 

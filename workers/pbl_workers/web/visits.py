@@ -63,8 +63,7 @@ class Curves:
 
 def curves_of(about: ShownVisit, found: Pooled, language: str) -> Curves | None:
     """Return the curves of the cycles that count, None without any."""
-    cycles = [c for c in found.cycles if c.used and c.curves]
-    if not cycles:
+    if not any(c.used and c.curves for c in found.cycles):
         return None
 
     def label(title: str, _: Ranges) -> str:
@@ -72,8 +71,8 @@ def curves_of(about: ShownVisit, found: Pooled, language: str) -> Curves | None:
 
     leg_m = None if found.scale is None else leg_length_m(found.scale)
     bands = normal_bands({name: measure for name, (measure, _) in about.measures.items()}, leg_m)
-    drawn = cycle_curves(cycles, bands, {name: ANGLES[name] for name in SHOWN}, label)
-    return Curves(tuple(drawn), bands, far_leg_of(cycles), adult_ranges())
+    drawn = cycle_curves(found.cycles, bands, {name: ANGLES[name] for name in SHOWN}, label)
+    return Curves(tuple(drawn), bands, far_leg_of(found.cycles), adult_ranges())
 
 
 def forces_of(kinetics: Kinetics, language: str) -> dict[str, Any]:
