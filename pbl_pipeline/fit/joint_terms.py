@@ -49,7 +49,7 @@ def inclination(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
     return arc(rises(pelvis))
 
 
-def arc(sine: Array, xp: Any = jnp) -> Array:
+def arc(sine: Any, xp: Any = jnp) -> Any:
     """Angle (rad) of a sine, taken just short of 1, where the derivative of the arc is infinite."""
     return xp.arcsin(0.999 * sine)
 
