@@ -147,7 +147,7 @@ def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
     values = [measures_of(c.cycle) for c in cycles]
     meant = meanings(GaitCycle)
     columns = _cycle_keys([c[:2] for c in cycles])
-    columns.append(Column("bout", _integers(c.cycle.bout for c in cycles), "", meant["bout"]))
+    columns.append(Column("bout", _integers(c.cycle.bout for c in cycles), "", "walking bout, from 0"))
     columns += [
         Column(name, _floats(getattr(c.cycle, name) for c in cycles), "s", f"{text}, from the first frame of the video")
         for name, text in meant.items()
