@@ -344,9 +344,7 @@ def test_body_marks_and_curves_are_in_one_view_where_there_is_no_picture(chromiu
             page.goto("/recordings/1")
             page.wait_for_selector("[data-ready]")
             page.locator("#correct").click()
-            for seen in (".space-view", ".line", "#curves figure >> nth=0"):
-                box = page.locator(seen).bounding_box()
-                assert 0 <= box["y"] < box["y"] + box["height"] <= height, (seen, width, box)
+            comes_into_view(page, ".space-view", ".line", "#curves figure >> nth=0")
 
 
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
@@ -419,6 +417,17 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     assert Decision.fetch1("decision_by") == "A. First"
 
 
+def comes_into_view(page: Any, *names: str) -> None:
+    """Wait until all these are in view at once."""
+    for _ in range(100):
+        boxes = [page.locator(name).bounding_box() for name in names]
+        height = page.viewport_size["height"]
+        if all(box and 0 <= box["y"] < box["y"] + box["height"] <= height for box in boxes):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(page.viewport_size, boxes)
+
+
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_picture_marks_and_curves_are_in_one_view_while_events_are_corrected(
     chromium: Any, visit: str, axe: str, language: str
@@ -436,13 +445,12 @@ def test_picture_marks_and_curves_are_in_one_view_while_events_are_corrected(
             page.goto("/recordings/1")
             page.wait_for_selector("[data-ready]")
             page.locator("#correct").click()
-            marks = page.locator(".track .mark")
-            marks.nth(6).click()
-            for seen in (".stage", ".line", "#curves figure >> nth=0"):
-                box = page.locator(seen).bounding_box()
-                assert 0 <= box["y"] < box["y"] + box["height"] <= height, (seen, width, box)
+            comes_into_view(page, ".stage", ".line", "#curves figure >> nth=0")
+            marks, values = page.locator(".track .mark"), page.locator("#curves output")
+            first = values.first.inner_text()
+            marks.nth(6).click()  # which may scroll the page before it clicks
+            page.wait_for_function("(last) => document.querySelector('#curves output').innerText !== last", arg=first)
             # Each curve has its values at the mark, and at the pointer while it is over one.
-            values = page.locator("#curves output")
             found = values.all_inner_texts()
             words = ("Left", "Right") if language == "en" else ("Links", "Rechts")
             assert len(found) == page.locator("#curves figure").count() > 4
