@@ -26,7 +26,7 @@ from .session import Session
 #: Markers of `opencap_35` on the pelvis.
 SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
 #: A trial with both thighs inclined by more than this (rad) at once, in more than this share of the frames, is one with
-#: sitting or squatting. Recorded walks, in a crouch too, reach 28 deg, a sprint 48; who sits or squats passes 83.
+#: sitting or squatting. Recorded walks, in a crouch too, reach 28 deg, a sprint 48; sitting and squats pass 83.
 FOLDED_RAD, FOLDED_SHARE = np.deg2rad(50.0), 0.05
 
 

@@ -278,7 +278,7 @@ def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, engl
         about = (action, name, [v[:12] for v in values])
         if answer.status_code == 303:
             continue
-        if name == "segment" and values != [""]:  # a list that nobody types into: another value is no form of the page
+        if name == "segment" and values != [""]:  # a list: other values do not come from the page
             assert answer.status_code == 415, about
             continue
         assert answer.status_code in (200, 400, 409), about
