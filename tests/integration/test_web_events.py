@@ -425,7 +425,7 @@ def comes_into_view(page: Any, *names: str) -> None:
         if all(box and 0 <= box["y"] < box["y"] + box["height"] <= height for box in boxes):
             return
         page.wait_for_timeout(50)
-    raise AssertionError(page.viewport_size, boxes)
+    raise AssertionError(names)
 
 
 @pytest.mark.parametrize("language", ["en", "de"])
