@@ -43,7 +43,7 @@ def cycle_curves(
     label
         Describes a chart in words, by the angle's title and its ranges.
     """
-    usable = [c for c in cycles if c.used and c.curves]
+    usable, faint = [c for c in cycles if c.used and c.curves], far_leg_of(cycles)
     off = {s: [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in usable if c.side == s] for s in SIDES}
     foot_off = {s: float(np.mean(values)) for s, values in off.items() if values}
     drawn = []
@@ -55,7 +55,7 @@ def cycle_curves(
         percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
         means = {s: np.mean(curves, axis=0, dtype=float) for s, curves in by_side.items() if curves}
         ranges = {s: (float(m.min()), float(m.max())) for s, m in means.items() if np.isfinite(m).all()}
-        picture = charts.cycle_chart(label(title, ranges), percent, by_side, foot_off, band, far_leg_of(cycles))
+        picture = charts.cycle_chart(label(title, ranges), percent, by_side, foot_off, band, faint)
         norm = None if band is None else (float(band[1].min()), float(band[1].max()))
         drawn.append(CycleCurve(name, title, positive, picture, ranges, norm))
     return drawn

@@ -79,15 +79,19 @@ def _changes(found: Any) -> list[dict[str, Any]]:
 
     out: list[dict[str, Any]] = []
     for _, own in found.groupby("subject", sort=False):
-        visits = own.to_dict("records")
-        for at, now in enumerate(visits):
-            earlier = [(v, r) for v in visits[:at] for r in results[v["session_id"]]]
-            for result in results[now["session_id"]]:
-                for name, mine in known(now, result).items():
-                    last = visit_before(result, [one for one in earlier if name in known(*one)])
-                    if last and (change := change_of(name, result, last[1], mine, known(*last)[name])):
-                        labels = {"visit": now["session_label"], "before": last[0]["session_label"]}
-                        out.append({"subject": now["subject"], **labels, **change.row(name), "fit": result.methods[0]})
+        earlier: list[tuple[tuple[str, dict[str, Measure | None]], Result]] = []
+        for now in own.to_dict("records"):
+            of_visit = [((now["session_label"], known(now, r)), r) for r in results[now["session_id"]]]
+            for (label, values), result in of_visit:
+                for name, value in values.items():
+                    last = visit_before(result, [one for one in earlier if name in one[0][1]])
+                    if last is None:
+                        continue
+                    (before, old), then = last
+                    if (change := change_of(name, result, then, value, old[name])) is not None:
+                        labels = {"subject": now["subject"], "visit": label, "before": before}
+                        out.append({**labels, **change.row(name), "fit": result.methods[0]})
+            earlier += of_visit
     return out
 
 
