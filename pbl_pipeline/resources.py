@@ -70,6 +70,8 @@ _THREADS = ("OMP_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
 #: Makes the GNU C library ask the kernel for large pages: of the 1.4 ms to keep a decoded picture, page faults of 4 KB
 #: took 1.1 ms (research/reports).
 _LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
+#: Makes Python not import from the current folder, which may hold another checkout.
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 #: The kernel's control groups, and the file that names those of this process.
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
@@ -147,15 +149,16 @@ def given_gpus() -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def shared_cores(processes: int) -> Iterator[None]:
+def shared_cores(processes: int) -> Iterator[dict[str, str]]:
     """Let each of several processes that are started in this block use its share of the cores only, and large pages of
-    memory. Variables of the libraries that are set already stay."""
+    memory. Variables of the libraries that are set already stay. Yields the variables, which a forked process sets."""
     share = str(max(1, cores() // processes))
-    defaults = dict.fromkeys(_THREADS, share) | _LARGE_PAGES
+    defaults = dict.fromkeys(_THREADS, share) | _LARGE_PAGES | _SAFE_PATH
     before = {name: os.environ.get(name) for name in (CORES, *defaults)}
-    os.environ |= defaults | {name: value for name, value in before.items() if value is not None} | {CORES: share}
+    given = defaults | {name: value for name, value in before.items() if value is not None} | {CORES: share}
+    os.environ |= given
     try:
-        yield
+        yield given
     finally:
         for name, value in before.items():
             if value is None:

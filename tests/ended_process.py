@@ -10,7 +10,7 @@ class Ended:
     exitcode, pid = 0, 0
 
     def __init__(self, args: tuple[Any, ...], **_: object) -> None:
-        self.options, _ = args
+        *_, self.options, _ = args
         self.sentinel, self._other_end = Pipe()
 
     def start(self) -> None: ...

@@ -15,6 +15,7 @@ decoder in the same process, of whatever thread, makes the recording fail.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import selectors
@@ -22,6 +23,7 @@ import socket
 import sys
 import threading
 import time
+from collections import defaultdict, deque
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -107,50 +109,71 @@ class Program:
 
 
 class _Served:
-    """A network and its connections.
+    """A network, and the pictures that wait for it: when each came, its connection, and where it lies."""
 
-    `device`: networks compute in turn, so that pictures accumulate for one while others compute; two at a time, so that
-    the pictures and results of one are copied while another computes.
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.images = np.zeros((program.batch, *program.image_shape), np.uint8)
+        self.waiting = deque[tuple[float, socket.socket, np.ndarray]]()
+        self.computes = False
+        self.answers = threading.Lock()  # those of one batch after those of the one before
+
+    def waited_s(self) -> float:
+        """Time that the pictures of the next batch have waited, in all; -1 if it cannot be computed now."""
+        if self.computes or not self.waiting:
+            return -1.0
+        now = time.monotonic()
+        return sum(now - came for came, *_ in itertools.islice(self.waiting, len(self.images)))
+
+
+class _Networks:
+    """Networks and their connections.
+
+    Two networks use the device at a time, so that the pictures and results of one are copied while another computes.
+    The next one is that whose pictures have waited longest, in all: of a network with few, more accumulate, while a
+    call for one of them would take the device as long as a full one.
     """
 
-    def __init__(self, program: Program, device: threading.Semaphore) -> None:
-        self._program, self._device = program, device
-        self._selector = selectors.DefaultSelector()  # each connection with its pictures
+    def __init__(self) -> None:
+        self._selector = selectors.DefaultSelector()  # each connection with its network and its memory
         self._changed = threading.Condition()
-        # One batch is filled while the other is computed; allocating memory for each would take longer than receiving.
-        self._images, self._spare = (np.zeros((program.batch, *program.image_shape), np.uint8) for _ in range(2))
-        self._owners = list[socket.socket]()
-        for work in (self._collect, self._compute):
+        self._served = list[_Served]()
+        self._computing = 0
+        for work in (self._collect, *[self._compute] * 2 * _NETWORKS_AT_ONCE):
             threading.Thread(target=work, daemon=True).start()
 
     @property
     def n_connections(self) -> int:
         return len(self._selector.get_map() or ())
 
-    def add(self, connection: socket.socket, memory: np.ndarray) -> None:
-        pictures = memory.reshape(-1, *self._program.image_shape)
-        self._selector.register(connection, selectors.EVENT_READ, (connection, pictures))
+    def served(self, program: Program) -> _Served:
+        """Return a new network."""
+        with self._changed:
+            self._served.append(_Served(program))
+            return self._served[-1]
+
+    def add(self, connection: socket.socket, served: _Served, memory: np.ndarray) -> None:
+        pictures = memory.reshape(-1, *served.program.image_shape)
+        self._selector.register(connection, selectors.EVENT_READ, (connection, served, pictures))
 
     def close(self) -> None:
         """End all connections."""
-        for connection, _ in [key.data for key in self._selector.get_map().values()]:
+        for connection, *_ in [key.data for key in self._selector.get_map().values()]:
             self._drop(connection)
 
     def _collect(self) -> None:
-        """Copy pictures into the batch that is computed next."""
+        """Note which pictures wait; they stay where they are until they are answered."""
         while True:
             for key, _ in self._selector.select(1.0):
-                connection, pictures = key.data
+                connection, served, pictures = key.data
                 places = _places(connection)
                 if not places or max(places) >= len(pictures):
                     self._drop(connection)
                     continue
-                for place in places:
-                    with self._changed:
-                        self._changed.wait_for(lambda: len(self._owners) < len(self._images))
-                        self._images[len(self._owners)] = pictures[place]
-                        self._owners.append(connection)
-                        self._changed.notify()
+                now = time.monotonic()
+                with self._changed:
+                    served.waiting.extend((now, connection, pictures[place]) for place in places)
+                    self._changed.notify()
 
     def _drop(self, connection: socket.socket) -> None:
         try:
@@ -159,27 +182,39 @@ class _Served:
         except (KeyError, OSError, ValueError):  # already closed
             return
 
+    def _next(self) -> _Served | None:
+        if self._computing < _NETWORKS_AT_ONCE and self._served:
+            longest = max(self._served, key=_Served.waited_s)
+            return longest if longest.waited_s() >= 0 else None
+        return None
+
     def _compute(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._owners)
-            with self._device:
-                with self._changed:  # includes pictures that came while others computed
-                    images, owners = self._images, self._owners
-                    self._images, self._owners = self._spare, []
+                while (served := self._next()) is None:
+                    self._changed.wait()
+                taken = [served.waiting.popleft() for _ in range(min(len(served.waiting), len(served.images)))]
+                self._computing, served.computes = self._computing + 1, True
+            try:
+                for image, (_, _, picture) in zip(served.images, taken, strict=False):
+                    image[:] = picture
+                found = served.program(served.images)
+            except Exception as error:  # noqa: BLE001 - the GPU failed: the clients fall back to LiteRT
+                sys.stderr.write(f"the GPU does not compute: {error}\n")
+                sys.stderr.flush()
+                os._exit(1)
+            with served.answers:
+                with self._changed:
+                    self._computing, served.computes = self._computing - 1, False
                     self._changed.notify()
-                try:
-                    found = self._program(images)
-                except Exception as error:  # noqa: BLE001 - the GPU failed: the clients fall back to LiteRT
-                    sys.stderr.write(f"the GPU does not compute: {error}\n")
-                    sys.stderr.flush()
-                    os._exit(1)
-            self._spare = images
-            for owner, outputs in zip(owners, found, strict=False):
-                try:
-                    owner.sendall(outputs.data)
-                except (OSError, ValueError):  # it ended, or takes no answers
-                    self._drop(owner)
+                rows = defaultdict[socket.socket, list[int]](list)
+                for row, (_, owner, _) in enumerate(taken):
+                    rows[owner].append(row)
+                for owner, of_owner in rows.items():
+                    try:
+                        owner.sendall(found[of_owner].data)
+                    except (OSError, ValueError):  # it ended, or takes no answers
+                        self._drop(owner)
 
 
 def _places(connection: socket.socket) -> bytes:
@@ -207,7 +242,7 @@ class Server:
         self._any_device, self._idle_s, self._batch = any_device, idle_s, batch
         self._served: dict[NetworkSpec, _Served] = {}
         self._locks: dict[NetworkSpec, threading.Lock] = {}
-        self._device = threading.Semaphore(_NETWORKS_AT_ONCE)
+        self._networks = _Networks()
         self._decoder, self._decoding = decoder, threading.Semaphore(_VIDEOS_AT_ONCE)
         self._readers = set[socket.socket]()  # connections whose videos are decoded
         self._opening = 0
@@ -230,8 +265,7 @@ class Server:
     def close(self) -> None:
         """Accept no further connections and end those that are open."""
         self._listener.close()
-        for served in self._served.values():
-            served.close()
+        self._networks.close()
 
     def _open(self, connection: socket.socket) -> None:
         self._opening += 1
@@ -247,17 +281,17 @@ class Server:
             try:
                 with self._locks.setdefault(spec, threading.Lock()):
                     if spec not in self._served:
-                        self._served[spec] = _Served(Program(spec, self._any_device, self._batch), self._device)
+                        self._served[spec] = self._networks.served(Program(spec, self._any_device, self._batch))
             except Exception as error:  # noqa: BLE001 - the client falls back to LiteRT and reports the reason
                 lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
                 send_line(connection, {"error": lines[0] if lines else type(error).__name__})
                 connection.close()
                 return
             served = self._served[spec]
-            program = served._program
+            program = served.program
             shape = program.image_shape
             send_line(connection, {"device": program.device, "sizes": program.sizes, "shape": shape})
-            served.add(connection, shared_memory(connection))
+            self._networks.add(connection, served, shared_memory(connection))
         except Exception:  # noqa: BLE001 - it does not keep to the protocol, or has ended
             connection.close()
         finally:
@@ -297,7 +331,7 @@ class Server:
         last = time.monotonic()
         while time.monotonic() - last < self._idle_s:
             time.sleep(min(1.0, self._idle_s / 4))
-            if self._opening or self._readers or any(s.n_connections for s in list(self._served.values())):
+            if self._opening or self._readers or self._networks.n_connections:
                 last = time.monotonic()
         self.close()
         os._exit(0)

@@ -234,13 +234,14 @@ def send_line(connection: socket.socket, value: object) -> None:
 
 
 def receive_line(connection: socket.socket) -> bytes:
-    """Return the next line. Raises EOFError if the other side has ended, ValueError for one without an end."""
+    """Return the next line, after which the other side waits. Raises EOFError if it has ended, ValueError for a line
+    without an end."""
     line = b""
     while not line.endswith(b"\n"):
-        byte = connection.recv(1)
-        if not byte:
+        part = connection.recv(1 << 16)
+        if not part:
             raise EOFError("the process that owns the GPU ended")
-        line += byte
+        line += part
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"a line of more than {_LONGEST_LINE} bytes")
     return line

@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -99,6 +99,12 @@ def _ends_without_device() -> Iterator[None]:
             raise
         event(log, logging.CRITICAL, "the device does not compute", error=reason)
         raise SystemExit(DEVICE_FAILED) from error
+
+
+def begin(given: dict[str, str], target: Callable[..., None], options: Options, pipe: Connection) -> None:
+    """Run `target` with these variables (`shared_cores`), which a process that was forked has from others."""
+    os.environ |= given
+    target(options, pipe)
 
 
 @_ends_without_device()

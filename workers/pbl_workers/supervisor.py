@@ -20,6 +20,7 @@ import math
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -34,7 +35,7 @@ from . import queue, recover, registry, run_job
 from .heartbeat import Heartbeat, Silent
 from .log import event
 from .metrics import Metrics
-from .process import DEVICE_FAILED, SELFTEST_FAILED, Options, work
+from .process import DEVICE_FAILED, SELFTEST_FAILED, Options, begin, work
 from .queue import Claim
 from .run_job import Outcome
 
@@ -50,6 +51,14 @@ HOPELESS = 5
 BATCH_NICE = 10
 #: After the grace period a process has this long to put its job back; then it is killed (s).
 LAST_S = 15.0
+
+
+def _stop_loaded() -> None:
+    """End the process that others were forked from, when these have ended: it would keep its memory and variables."""
+    if sys.platform == "linux":
+        from multiprocessing import forkserver
+
+        forkserver._forkserver._stop()  # pyright: ignore[reportAttributeAccessIssue] - there is no public name
 
 
 @dataclasses.dataclass
@@ -117,8 +126,11 @@ class Supervisor:
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
         self._unsettled: list[Callable[[], Any]] = []  # what is to become of jobs of processes that died
         self._settle_at = 0.0
-        # Not fork: threads of the numerical libraries do not survive it.
-        self._start = multiprocessing.get_context("spawn")
+        # Of a process that only has them loaded: a copy begins at once, and shares the memory of the libraries. Not of
+        # this one: its threads would not survive it.
+        self._start = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+        if sys.platform == "linux":
+            multiprocessing.set_forkserver_preload(["pbl_workers.loaded"])
 
     def stop(self, *_: object) -> None:
         """Let the running jobs end within the grace period; called again, do not wait for them."""
@@ -131,7 +143,9 @@ class Supervisor:
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
             with Heartbeat(worker.SUPERVISOR) as self._beats:
-                return self._watch()
+                code = self._watch()
+            _stop_loaded()
+            return code
         finally:
             for s, handler in before.items():
                 signal.signal(s, handler)
@@ -160,9 +174,14 @@ class Supervisor:
     def _launch(self, number: int) -> _Child:
         here, there = self._start.Pipe(duplex=False)
         options = self.options.of_process(number)
-        process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
-        with shared_cores(1 if options.phone else self.options.processes + options.long):
-            process.start()
+        with shared_cores(1 if options.phone else self.options.processes + options.long) as given:
+            arguments = (given, self.target, options, there)
+            process = self._start.Process(target=begin, args=arguments, name="pbl-worker")
+            try:
+                process.start()
+            except EOFError:  # the process with the libraries was killed meanwhile
+                process = multiprocessing.get_context("spawn").Process(target=begin, args=arguments, name="pbl-worker")
+                process.start()
         if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
             # From here, before its libraries start threads, which keep the priority they began with.
             with contextlib.suppress(OSError):  # it has ended

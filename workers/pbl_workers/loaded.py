@@ -1,0 +1,14 @@
+"""The libraries of a working process, loaded: the supervisor has its processes forked from one that imported this."""
+
+# ruff: noqa: E402, F401
+import gc
+
+from pbl_pipeline.resources import fewer_collections
+
+fewer_collections()
+
+import pbl_pipeline.pipeline
+import pbl_workers.loop
+import pbl_workers.selftest
+
+gc.freeze()  # their pages stay shared: the collector writes to each object that it looks at
