@@ -120,9 +120,12 @@ def work(options: Options, pipe: Connection) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
     import pbl_schemas
+    from pbl_pipeline.jax_setup import use_cpu
 
     from . import heartbeat, loop, selftest
 
+    if options.phone:
+        use_cpu()  # JAX was imported, and read its variable, before
     stop = threading.Event()
 
     def end(*_: object) -> None:

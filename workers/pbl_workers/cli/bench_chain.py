@@ -7,6 +7,7 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ MANY = (1_000, 100_000, 1_000_000)
 @dataclasses.dataclass(frozen=True)
 class Measured:
     """Recordings computed one after another by the processes of one worker, from the first report to the last one.
-    processor_s: of all processes, with their start. jobs_s: time of the jobs by table, with the other processes
+    processor_s: of their processes. jobs_s: time of the jobs by table, with the other processes
     running. original_bytes: of the recordings; result_bytes: of store and tables."""
 
     videos: int
@@ -189,13 +190,15 @@ def _registered(folder: Path, film: bytes, first: int, n: int) -> list[Path]:
 def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, dict[str, float]]:
     """Work until nothing is left; return the seconds from the first report to the last one, processor time, and time of
     the jobs by table. Raises the `PblError` of a failed job, and INTERNAL if recordings have no index."""
+    from pbl_pipeline.temporary import new_folder
     from pbl_schemas import gdi
     from pbl_workers.metrics import KeptReports
     from pbl_workers.supervisor import Supervisor
 
-    metrics, had, begin = KeptReports(), len(gdi.SessionGdi()), os.times()
-    Supervisor(options, metrics).run()
-    end = os.times()
+    metrics, had = KeptReports(), len(gdi.SessionGdi())
+    with new_folder() as spent:
+        Supervisor(options, metrics, target=partial(_timed, spent)).run()
+        processor_s = sum(float(p.read_text("utf-8")) for p in spent.iterdir())
     outcomes = [outcome for _, _, outcome in metrics.reports if outcome is not None]
     failed = [outcome for outcome in outcomes if outcome.code]
     jobs_s: dict[str, float] = defaultdict(float)
@@ -208,8 +211,17 @@ def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, di
             expected="a recording whose index can be computed",
             next_step="try it alone with `pbl run`",
         )
-    processor_s = end.children_user + end.children_system - begin.children_user - begin.children_system
     return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, dict(jobs_s)
+
+
+def _timed(folder: Path, options: Any, pipe: Any) -> None:
+    """`work`, whose processor time is written to a file of `folder`."""
+    from pbl_workers.process import work
+
+    try:
+        work(options, pipe)
+    finally:
+        (folder / str(os.getpid())).write_text(str(sum(os.times()[:4])), encoding="utf-8")
 
 
 def _stored(folder: Path) -> int:
