@@ -173,7 +173,8 @@ class _Networks:
                 now = time.monotonic()
                 with self._changed:
                     served.waiting.extend((now, connection, pictures[place]) for place in places)
-                    self._changed.notify()
+                    if self._computing < _NETWORKS_AT_ONCE and not served.computes:
+                        self._changed.notify()
 
     def _drop(self, connection: socket.socket) -> None:
         try:

@@ -4,11 +4,14 @@ ended; and neither waits for a database that does not answer."""
 import contextlib
 import multiprocessing
 import os
+import signal
 import socket
 import threading
 import time
 import urllib.request
-from multiprocessing import Pipe
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import Pipe, forkserver
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -324,12 +327,15 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch, enviro
     phones."""
     for name in ("_connected", "to_stderr", "signal.signal"):
         monkeypatch.setattr(f"pbl_workers.process.{name}", lambda *_: False)  # it ends where it would connect
+    on_cpu = mock.Mock()
+    monkeypatch.setattr("pbl_pipeline.jax_setup.use_cpu", on_cpu)  # JAX is loaded before it has the variable
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
         for value in ("", None):  # put back what the process sets
             environment(**dict.fromkeys((VISIBLE_GPUS, MEMORY, *CPU), value))
         process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
         seen.append(tuple(map(os.environ.get, (VISIBLE_GPUS, MEMORY, *CPU))))
+        assert on_cpu.call_count == (number == processes)
     no = (None, None)
     assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
 
@@ -389,19 +395,54 @@ def test_one_full_gpu_stops_no_other_process(tmp_path: Path, limits: Limits):
     told: list[str] = []
 
     def look() -> None:
-        try:
-            until(lambda: (tmp_path / "full").exists() and starts(tmp_path, "full") > HOPELESS, 60)
-            told.append(str(boss._places[1]))
-        finally:
-            boss.stop()
+        until(lambda: (tmp_path / "full").exists() and starts(tmp_path, "full") > HOPELESS, 60)
+        told.append(str(boss._places[1]))
 
-    beside = threading.Thread(target=look)
-    beside.start()
-    assert boss.run() == 0
-    beside.join()
+    assert beside(boss, look) == 0
     assert starts(tmp_path, "free") == starts(tmp_path, "also free") == 1
     (text,) = told
     assert text.startswith("process 2 (GPU full) starts again 0.2 s after it died: its GPU does not compute")
+
+
+def beside(boss: Supervisor, look: Callable[[], None]) -> int:
+    """Run a worker, and `look` beside it, which ends it."""
+
+    def looks() -> None:
+        try:
+            look()
+        finally:
+            boss.stop()
+
+    with ThreadPoolExecutor(1) as thread:
+        seen = thread.submit(looks)
+        code = boss.run()
+    seen.result()
+    return code
+
+
+def test_where_the_process_with_the_libraries_is_killed_all_begin_anew(tmp_path: Path, limits: Limits):
+    """They die with it: the supervisor would hear no more of how they end."""
+    limits(supervisor, RESTART_S=(0.05, 0.2))
+    gpus = ("first", "second")
+
+    def look() -> None:
+        until(lambda: all((tmp_path / gpu).exists() for gpu in gpus), 60)
+        before = [int((tmp_path / gpu).read_text(encoding="utf-8")) for gpu in gpus]
+        os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)  # pyright: ignore
+        until(lambda: all(starts(tmp_path, gpu) == 2 for gpu in gpus), 60)
+        assert not any(Path(f"/proc/{pid}").exists() for pid in before)
+
+    assert beside(of_gpus(tmp_path, *gpus), look) == 0
+
+
+def test_the_current_folder_is_not_imported_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may hold another checkout."""
+    other = tmp_path / "pbl_workers"
+    other.mkdir()
+    (other / "__init__.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert of_gpus(tmp_path, "idle", once=True).run() == 0
+    assert (starts(tmp_path, "idle"), (tmp_path / "imported").exists()) == (1, False)
 
 
 @pytest.mark.parametrize("phones", [False, True])

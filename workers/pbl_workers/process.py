@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import functools
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
@@ -28,6 +30,7 @@ log = logging.getLogger("pbl.worker")
 
 #: Exit code of a process whose self-test failed: starting another would not help.
 SELFTEST_FAILED = 3
+_PR_SET_PDEATHSIG = 1  # of Linux' prctl.h
 #: Exit code of a process whose GPU does not compute, such as one without free memory.
 DEVICE_FAILED = 4
 
@@ -102,7 +105,10 @@ def _ends_without_device() -> Iterator[None]:
 
 
 def begin(given: dict[str, str], target: Callable[..., None], options: Options, pipe: Connection) -> None:
-    """Run `target` with these variables (`shared_cores`), which a process that was forked has from others."""
+    """Run `target` with these variables (`shared_cores`), which a process that was forked has from others. It dies with
+    the one that it was forked from, as the supervisor hears from that one how it ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.environ |= given
     target(options, pipe)
 
