@@ -60,11 +60,6 @@ def configure() -> None:
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 
 
-def use_cpu() -> None:
-    """Let JAX compute on the CPU in this process, also where it was imported before. Call before the first array."""
-    jax.config.update("jax_platforms", "cpu")
-
-
 def known_flags(release: str, gpu: bool) -> tuple[str, ...]:
     """Return the flags that were run on this release of jaxlib, with a plugin for GPUs or without one."""
     if gpu:

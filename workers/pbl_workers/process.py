@@ -120,18 +120,18 @@ def work(options: Options, pipe: Connection) -> None:
     if options.gpus:
         os.environ[VISIBLE_GPUS] = options.gpus[0]
     if options.phone:
+        import jax
+
         os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
+        jax.config.update("jax_platforms", "cpu")  # it may have been imported, and have read its variable, before
     if options.processes > 1:
         # Otherwise JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
     import pbl_schemas
-    from pbl_pipeline.jax_setup import use_cpu
 
     from . import heartbeat, loop, selftest
 
-    if options.phone:
-        use_cpu()  # JAX was imported, and read its variable, before
     stop = threading.Event()
 
     def end(*_: object) -> None:

@@ -53,14 +53,6 @@ BATCH_NICE = 10
 LAST_S = 15.0
 
 
-def _stop_loaded() -> None:
-    """End the process that others were forked from, when these have ended: it would keep its memory and variables."""
-    if sys.platform == "linux":
-        from multiprocessing import forkserver
-
-        forkserver._forkserver._stop()  # pyright: ignore[reportAttributeAccessIssue] - there is no public name
-
-
 @dataclasses.dataclass
 class _Child:
     process: Any
@@ -144,7 +136,8 @@ class Supervisor:
         try:
             with Heartbeat(worker.SUPERVISOR) as self._beats:
                 code = self._watch()
-            _stop_loaded()
+            if sys.platform == "linux":  # it would keep its memory and its variables
+                multiprocessing.forkserver._forkserver._stop()  # pyright: ignore - there is no public name
             return code
         finally:
             for s, handler in before.items():
