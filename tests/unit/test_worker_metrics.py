@@ -435,6 +435,24 @@ def test_where_the_process_with_the_libraries_is_killed_all_begin_anew(tmp_path:
     assert beside(of_gpus(tmp_path, *gpus), look) == 0
 
 
+def test_signals_to_all_processes_do_not_end_the_one_with_the_libraries(tmp_path: Path, limits: Limits):
+    """As of a terminal and of systemd: a job that runs may end."""
+    limits(supervisor, RESTART_S=(0.05, 0.2))
+    boss = of_gpus(tmp_path, "first")
+    multiprocessing.set_forkserver_preload(["pbl_workers.loaded"])
+
+    def look() -> None:
+        until((tmp_path / "first").exists, 60)
+        with_libraries = forkserver._forkserver._forkserver_pid  # pyright: ignore
+        for sent in (signal.SIGINT, signal.SIGTERM):
+            os.kill(with_libraries, sent)
+        os.kill(int((tmp_path / "first").read_text(encoding="utf-8")), signal.SIGKILL)
+        until(lambda: starts(tmp_path, "first") == 2, 60)
+        assert forkserver._forkserver._forkserver_pid == with_libraries  # pyright: ignore
+
+    assert beside(boss, look) == 0
+
+
 def test_the_current_folder_is_not_imported_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """It may hold another checkout."""
     other = tmp_path / "pbl_workers"

@@ -2,10 +2,14 @@
 
 # ruff: noqa: E402, F401
 import gc
+import signal
 
 from pbl_pipeline.resources import fewer_collections
 
 fewer_collections()
+# A terminal and systemd send them to all processes; the supervisor decides.
+for _sent in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(_sent, signal.SIG_IGN)
 
 import pbl_pipeline.pipeline
 import pbl_workers.loop

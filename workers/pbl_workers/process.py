@@ -109,6 +109,7 @@ def begin(given: dict[str, str], target: Callable[..., None], options: Options, 
     the one that it was forked from, as the supervisor hears from that one how it ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # that one ignores it
     os.environ |= given
     target(options, pipe)
 
