@@ -347,6 +347,17 @@ def test_body_marks_and_curves_are_in_one_view_where_there_is_no_picture(chromiu
             comes_into_view(page, ".space-view", ".line", "#curves figure >> nth=0")
 
 
+def test_a_frame_that_the_browser_does_not_tell_is_shown(chromium: Any, visit: str):
+    """Of two seeks within milliseconds Chromium tells the first at times."""
+    with web.shown(chromium, name="A. First") as page:
+        page.goto("/recordings/1")
+        page.wait_for_selector("[data-ready]")
+        page.evaluate("HTMLVideoElement.prototype.requestVideoFrameCallback = () => 0")
+        for frame in (1, 2, 3):
+            page.get_by_role("button", name="One frame forward").click()
+            page.wait_for_selector(f"canvas.body[data-frame='{frame}']", timeout=10_000)
+
+
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     before = not_none(event_corrections.shown_events(1))
     with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:

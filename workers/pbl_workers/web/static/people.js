@@ -54,6 +54,9 @@ function boxesOf(stage, video, form) {
     video.requestVideoFrameCallback(follow);
   };
 
+  // As in recording.js: not every frame is told.
+  video.addEventListener("seeked", () => { if (video.paused && !video.seeking && !into.hidden) show(video.currentTime); });
+
   const on = async () => {
     into.hidden = false;
     if (!people) {
