@@ -40,7 +40,7 @@ from pbl_workers.process import Options
 from pbl_workers.recover import CRASHES
 from pbl_workers.supervisor import BATCH_NICE, Supervisor
 from research.benchmarks import worker_replay
-from tests import Faults, Limits, until
+from tests import Faults, Limits, ended_process, until
 from tests.rows import one_query_at_a_time, register
 
 from . import chain, worker_target
@@ -211,24 +211,6 @@ def test_who_has_the_pictures_takes_all_that_needs_them_unless_another_job_is_mo
     assert [(j.table.__name__, j.key["video_id"]) for j in taken if j.table.__name__ in of_pictures] == expected
 
 
-def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
-    """Run a supervisor while a thread does this, which stops it then; the exit code."""
-
-    def do() -> None:
-        try:
-            done()
-        finally:
-            boss.stop()
-
-    beside = threading.Thread(target=do)
-    with one_query_at_a_time():
-        beside.start()
-        try:
-            return boss.run()
-        finally:
-            beside.join()
-
-
 @pytest.fixture
 def of_lengths(tables: None, tmp_path: Path, limits: Limits) -> dict[str, int]:
     """Recordings by name, the long ones first; all wait to be read."""
@@ -269,6 +251,11 @@ def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[s
     work(takes=takes(first.short, phones=False, phone=False))
     assert jobs_left() == {}
     assert not Options(processes=1, once=True).of_process(0).short  # it does everything
+
+
+def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
+    with one_query_at_a_time():
+        return ended_process.run_until(boss, done)
 
 
 def test_nothing_waits_behind_a_long_recording_for_a_lone_process(of_lengths: dict[str, int], tmp_path: Path):

@@ -9,8 +9,6 @@ import socket
 import threading
 import time
 import urllib.request
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import Pipe, forkserver
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,7 +33,7 @@ from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import HOPELESS, Supervisor, _Child
 from tests import Environment, Limits, Machine, refused, until
 from tests.command import program
-from tests.ended_process import Ended
+from tests.ended_process import Ended, run_until
 
 from . import gpu_by_name
 
@@ -398,30 +396,14 @@ def test_one_full_gpu_stops_no_other_process(tmp_path: Path, limits: Limits):
         until(lambda: (tmp_path / "full").exists() and starts(tmp_path, "full") > HOPELESS, 60)
         told.append(str(boss._places[1]))
 
-    assert beside(boss, look) == 0
+    assert run_until(boss, look) == 0
     assert starts(tmp_path, "free") == starts(tmp_path, "also free") == 1
     (text,) = told
     assert text.startswith("process 2 (GPU full) starts again 0.2 s after it died: its GPU does not compute")
 
 
-def beside(boss: Supervisor, look: Callable[[], None]) -> int:
-    """Run a worker, and `look` beside it, which ends it."""
-
-    def looks() -> None:
-        try:
-            look()
-        finally:
-            boss.stop()
-
-    with ThreadPoolExecutor(1) as thread:
-        seen = thread.submit(looks)
-        code = boss.run()
-    seen.result()
-    return code
-
-
 def test_where_the_process_with_the_libraries_is_killed_all_begin_anew(tmp_path: Path, limits: Limits):
-    """They die with it: the supervisor would hear no more of how they end."""
+    """They die with it: the supervisor would not hear how they end."""
     limits(supervisor, RESTART_S=(0.05, 0.2))
     gpus = ("first", "second")
 
@@ -432,7 +414,7 @@ def test_where_the_process_with_the_libraries_is_killed_all_begin_anew(tmp_path:
         until(lambda: all(starts(tmp_path, gpu) == 2 for gpu in gpus), 60)
         assert not any(Path(f"/proc/{pid}").exists() for pid in before)
 
-    assert beside(of_gpus(tmp_path, *gpus), look) == 0
+    assert run_until(of_gpus(tmp_path, *gpus), look) == 0
 
 
 def test_signals_to_all_processes_do_not_end_the_one_with_the_libraries(tmp_path: Path, limits: Limits):
@@ -450,7 +432,7 @@ def test_signals_to_all_processes_do_not_end_the_one_with_the_libraries(tmp_path
         until(lambda: starts(tmp_path, "first") == 2, 60)
         assert forkserver._forkserver._forkserver_pid == with_libraries  # pyright: ignore
 
-    assert beside(boss, look) == 0
+    assert run_until(boss, look) == 0
 
 
 def test_the_current_folder_is_not_imported_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

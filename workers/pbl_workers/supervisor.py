@@ -137,7 +137,7 @@ class Supervisor:
             with Heartbeat(worker.SUPERVISOR) as self._beats:
                 code = self._watch()
             if sys.platform == "linux":  # it would keep its memory and its variables
-                multiprocessing.forkserver._forkserver._stop()  # pyright: ignore - there is no public name
+                multiprocessing.forkserver._forkserver._stop()  # pyright: ignore - a public name does not exist
             return code
         finally:
             for s, handler in before.items():
