@@ -172,7 +172,7 @@ class Supervisor:
             process = self._start.Process(target=begin, args=arguments, name="pbl-worker")
             try:
                 process.start()
-            except EOFError:  # the process with the libraries was killed meanwhile
+            except (EOFError, OSError):  # the process with the libraries was killed meanwhile
                 process = multiprocessing.get_context("spawn").Process(target=begin, args=arguments, name="pbl-worker")
                 process.start()
         if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
