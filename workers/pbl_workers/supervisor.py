@@ -22,7 +22,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -51,6 +51,24 @@ HOPELESS = 5
 BATCH_NICE = 10
 #: After the grace period a process has this long to put its job back; then it is killed (s).
 LAST_S = 15.0
+
+
+@contextlib.contextmanager
+def _copies_of(module: str) -> Iterator[None]:
+    """Fork processes from one that has imported a module; before and after the block, others are copies of another
+    one, with other variables (`pbl_pipeline.limited`)."""
+    if sys.platform != "linux":
+        yield
+        return
+    from multiprocessing import forkserver
+
+    copied: Any = forkserver._forkserver  # pyright: ignore - ending it has no public name
+    others = copied._preload_modules
+    copied._stop()
+    copied.set_forkserver_preload([module])
+    yield
+    copied._stop()
+    copied.set_forkserver_preload(others)
 
 
 @dataclasses.dataclass
@@ -121,8 +139,7 @@ class Supervisor:
         # Of a process that only has them loaded: a copy begins at once, and shares the memory of the libraries. Not of
         # this one: its threads would not survive it.
         self._start = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-        if sys.platform == "linux":
-            multiprocessing.set_forkserver_preload(["pbl_workers.loaded"])
+        self.loaded = "pbl_workers.loaded"
 
     def stop(self, *_: object) -> None:
         """Let the running jobs end within the grace period; called again, do not wait for them."""
@@ -134,11 +151,8 @@ class Supervisor:
         """Watch until every process has ended (`once`), or until SIGTERM or SIGINT."""
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
-            with Heartbeat(worker.SUPERVISOR) as self._beats:
-                code = self._watch()
-            if sys.platform == "linux":  # it would keep its memory and its variables
-                multiprocessing.forkserver._forkserver._stop()  # pyright: ignore - a public name does not exist
-            return code
+            with Heartbeat(worker.SUPERVISOR) as self._beats, _copies_of(self.loaded):
+                return self._watch()
         finally:
             for s, handler in before.items():
                 signal.signal(s, handler)
