@@ -30,9 +30,9 @@ log = logging.getLogger("pbl.worker")
 
 #: Exit code of a process whose self-test failed: starting another would not help.
 SELFTEST_FAILED = 3
-_PR_SET_PDEATHSIG = 1  # of Linux' prctl.h
 #: Exit code of a process whose GPU does not compute, such as one without free memory.
 DEVICE_FAILED = 4
+_PR_SET_PDEATHSIG = 1  # of Linux' prctl.h
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,8 +25,8 @@ MANY = (1_000, 100_000, 1_000_000)
 @dataclasses.dataclass(frozen=True)
 class Measured:
     """Recordings computed one after another by the processes of one worker, from the first report to the last one.
-    processor_s: of their processes. jobs_s: time of the jobs by table, with the other processes
-    running. original_bytes: of the recordings; result_bytes: of store and tables."""
+    processor_s: of these processes. jobs_s: time of the jobs by table, with the other processes running.
+    original_bytes: of the recordings; result_bytes: of store and tables."""
 
     videos: int
     video_s: float
