@@ -136,7 +136,7 @@ class Supervisor:
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
         self._unsettled: list[Callable[[], Any]] = []  # what is to become of jobs of processes that died
         self._settle_at = 0.0
-        # Copies of a process that has only loaded the libraries (`_copies_of`): they begin at once and share its memory.
+        # Copies of a process that has only loaded the libraries (`_copies_of`): they begin at once, with its memory.
         # Not copies of this one: its threads would not survive that.
         self._start = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
         self.loaded = "pbl_workers.loaded"
