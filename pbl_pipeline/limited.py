@@ -14,9 +14,14 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+
+from .resources import SAFE_PATH, variables
+
+_BEGINS = threading.Lock()  # of the process that is copied
 
 
 class LimitExceeded(Exception):
@@ -60,6 +65,9 @@ def limited(
     how = (theirs, dict(os.environ), n_bytes, seconds, returns, function, args)
     process = context.Process(target=_call, args=how, daemon=True)
     try:
+        if sys.platform == "linux":
+            with _BEGINS, variables(SAFE_PATH):
+                forkserver.ensure_running()
         process.start()
     except (EOFError, OSError) as error:  # the process that is copied was killed, or the machine is full
         raise LimitExceeded(f"its process did not start: {error}") from error

@@ -71,7 +71,7 @@ _THREADS = ("OMP_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
 #: took 1.1 ms (research/reports).
 _LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 #: Makes Python not import from the current folder, which may hold another checkout.
-_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 #: The kernel's control groups, and the file that names those of this process.
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
@@ -153,12 +153,19 @@ def shared_cores(processes: int) -> Iterator[dict[str, str]]:
     """Let each of several processes that are started in this block use its share of the cores only, and large pages of
     memory. Variables of the libraries that are set already stay. Yields the variables, which a forked process sets."""
     share = str(max(1, cores() // processes))
-    defaults = dict.fromkeys(_THREADS, share) | _LARGE_PAGES | _SAFE_PATH
-    before = {name: os.environ.get(name) for name in (CORES, *defaults)}
-    given = defaults | {name: value for name, value in before.items() if value is not None} | {CORES: share}
+    defaults = dict.fromkeys(_THREADS, share) | _LARGE_PAGES | SAFE_PATH
+    given = {name: os.environ.get(name, value) for name, value in defaults.items()} | {CORES: share}
+    with variables(given):
+        yield given
+
+
+@contextlib.contextmanager
+def variables(given: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for processes that are started in this block."""
+    before = {name: os.environ.get(name) for name in given}
     os.environ |= given
     try:
-        yield given
+        yield
     finally:
         for name, value in before.items():
             if value is None:

@@ -5,6 +5,7 @@ import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import forkserver
+from pathlib import Path
 
 import pytest
 
@@ -38,6 +39,17 @@ def test_a_process_that_cannot_start_says_nothing_about_what_it_was_to_do():
 def test_what_is_preloaded_sets_no_environment():
     """A copy would lose it: `jax_setup` sets XLA's flags when it is imported."""
     assert not limited(_loaded, "pbl_pipeline.jax_setup", returns=True)
+
+
+def test_the_current_folder_is_not_imported_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may hold another checkout, or a file with the name of a module of Python."""
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    for module in ("pbl_pipeline", "selectors"):
+        (tmp_path / f"{module}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]
+    assert limited(os.getenv, "PYTHONSAFEPATH", returns=True) is None
+    assert not (tmp_path / "imported").exists()
 
 
 def _loaded(module: str) -> bool:
