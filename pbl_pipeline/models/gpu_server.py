@@ -119,9 +119,7 @@ class _Served:
         self.answers = threading.Lock()  # those of one batch after those of the one before
 
     def waited_s(self) -> float:
-        """Time that the pictures of the next batch have waited, in all; -1 if it cannot be computed now."""
-        if self.computes or not self.waiting:
-            return -1.0
+        """Time that the pictures of the next batch have waited, in all."""
         now = time.monotonic()
         return sum(now - came for came, *_ in itertools.islice(self.waiting, len(self.images)))
 
@@ -184,10 +182,10 @@ class _Networks:
             return
 
     def _next(self) -> _Served | None:
-        if self._computing < _NETWORKS_AT_ONCE and self._served:
-            longest = max(self._served, key=_Served.waited_s)
-            return longest if longest.waited_s() >= 0 else None
-        return None
+        if self._computing == _NETWORKS_AT_ONCE:
+            return None
+        ready = [s for s in self._served if s.waiting and not s.computes]
+        return max(ready, key=_Served.waited_s, default=None)
 
     def _compute(self) -> None:
         while True:
