@@ -62,12 +62,10 @@ def limited(
     """
     context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
     ours, theirs = context.Pipe(duplex=False)
-    how = (theirs, dict(os.environ), n_bytes, seconds, returns, function, args)
-    process = context.Process(target=_call, args=how, daemon=True)
     try:
-        if sys.platform == "linux":
-            with _BEGINS, variables(SAFE_PATH):
-                forkserver.ensure_running()
+        environment = _begun()
+        how = (theirs, environment, n_bytes, seconds, returns, function, args)
+        process = context.Process(target=_call, args=how, daemon=True)
         process.start()
     except (EOFError, OSError) as error:  # the process that is copied was killed, or the machine is full
         raise LimitExceeded(f"its process did not start: {error}") from error
@@ -98,6 +96,19 @@ def limited(
     if error is not None:
         raise error
     return result
+
+
+def _begun() -> dict[str, str]:
+    """Start the process that is copied, unless it runs; return the environment."""
+    with _BEGINS:
+        environment = dict(os.environ)
+        if sys.platform == "linux":
+            copied: Any = forkserver._forkserver  # pyright: ignore - whether it runs has no public name
+            pid, options = copied._forkserver_pid, os.WEXITED | os.WNOHANG | os.WNOWAIT
+            if pid is None or os.waitid(os.P_PID, pid, options):
+                with variables(SAFE_PATH):
+                    forkserver.ensure_running()
+        return environment
 
 
 def _call(

@@ -12,6 +12,7 @@ import secrets
 import shutil
 import tempfile
 import time
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 #: Names begin with this; the number of the process and a random word follow, because the processes of a container that
@@ -23,6 +24,11 @@ _EARLIER, _UNCHANGED_S = ("pbl-files-", "pbl-web-"), 86_400.0
 
 class TemporaryFolder(tempfile.TemporaryDirectory[str]):
     """A folder that is removed at the end of its `with` block, by `cleanup()`, or when no one holds the object."""
+
+    def __init__(self, beside: Path | None, prefix: str) -> None:
+        super().__init__(dir=beside, prefix=prefix)
+        # At the end of a forked process, in which Python runs `atexit` from 3.13 on.
+        Finalize(self, shutil.rmtree, (self.name, True), exitpriority=0)
 
     @property
     def path(self) -> Path:
@@ -44,7 +50,7 @@ def new_folder(beside: Path | None = None) -> TemporaryFolder:
     if beside is not None:
         sweep(beside)
     hidden = "." if beside is not None else ""
-    return TemporaryFolder(dir=beside, prefix=f"{hidden}{_PREFIX}{os.getpid()}-{_OWN}-")
+    return TemporaryFolder(beside, f"{hidden}{_PREFIX}{os.getpid()}-{_OWN}-")
 
 
 def free_bytes() -> int:

@@ -52,6 +52,13 @@ def test_the_current_folder_is_not_imported_from(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "imported").exists()
 
 
+def test_the_environment_changes_only_where_the_process_that_is_copied_begins(monkeypatch: pytest.MonkeyPatch):
+    """Other threads may be reading it."""
+    limited(os.getpid)
+    monkeypatch.setattr("pbl_pipeline.limited.variables", None)
+    assert limited(os.getpid, returns=True)
+
+
 def _loaded(module: str) -> bool:
     import pbl_pipeline.video  # noqa: F401
 

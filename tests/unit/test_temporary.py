@@ -1,12 +1,14 @@
 """Temporary folders: gone with their process, or with the next command where it was killed."""
 
 import json
+import multiprocessing
 import os
 import re
 import stat
 import subprocess
 import sys
 import tempfile
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,26 @@ def test_what_a_killed_process_left_goes_with_the_next_command(folder: Path, wha
         assert pbl("models", "--help").code == 0
         assert list(folder.iterdir()) == [used]
     assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("how", [m for m in multiprocessing.get_all_start_methods() if m != "fork"])
+def test_a_process_that_ends_leaves_none(how: str):
+    """Python runs `atexit` at the end of a forked process from 3.13 on."""
+    context = multiprocessing.get_context(how)
+    here, there = context.Pipe()
+    process = context.Process(target=_keeps, args=[there])
+    process.start()
+    left = here.recv()
+    process.join()
+    assert (left.exists(), process.exitcode) == (False, 0)
+
+
+_KEPT: list[object] = []
+
+
+def _keeps(pipe: Connection) -> None:
+    _KEPT.append(folder := temporary.new_folder())
+    pipe.send(folder.path)
 
 
 def test_what_is_not_ours_or_in_use_stays(folder: Path, tmp_path_factory: pytest.TempPathFactory):

@@ -27,7 +27,7 @@ from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
 from pbl_workers import log, metrics, process, recover, registry, run_job, selftest, supervisor
 from pbl_workers.metrics import Metrics
-from pbl_workers.process import Options
+from pbl_workers.process import UNHEARD, Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import HOPELESS, Supervisor, _Child
@@ -422,6 +422,18 @@ def test_where_the_process_with_the_libraries_is_killed_all_begin_anew(tmp_path:
     assert run_until(of_gpus(tmp_path, *gpus), look) == 0
 
 
+def test_a_process_that_is_told_to_end_as_it_begins_does(tmp_path: Path):
+    """It may be started a moment before the worker is stopped."""
+    boss = of_gpus(tmp_path, "first")
+    with supervisor._copies_of("pbl_workers.loaded"):
+        started = boss._launch(0).process
+        os.kill(started.pid, signal.SIGTERM)
+        started.join(20)
+        started.kill()
+        started.join()
+    assert started.exitcode == -signal.SIGTERM
+
+
 def test_signals_to_all_processes_do_not_end_the_one_with_the_libraries(tmp_path: Path, limits: Limits):
     """As of a terminal and of systemd: a job that runs may end."""
     limits(supervisor, RESTART_S=(0.05, 0.2))
@@ -460,6 +472,18 @@ def test_a_worker_ends_where_no_process_can_run(
     assert (starts(tmp_path, "full") >= HOPELESS, starts(tmp_path, "wrong")) == (True, 1)
     (end,) = [record for record in caplog.records if record.message == "giving up"]
     assert "process 2 (GPU wrong) is not started again: its self-test failed" in log.JsonLines().format(end)
+
+
+def test_jobs_of_a_process_whose_end_nobody_heard_count_no_crash(monkeypatch: pytest.MonkeyPatch):
+    """The one that it was forked from died, for which no job is to blame."""
+    boss, process, back = Supervisor(Options(), Metrics()), Process(), []
+    monkeypatch.setattr(connection, "connect", lambda: None)
+    monkeypatch.setattr("pbl_workers.queue.put_back", lambda job, reason: back.append((job.key, reason)))
+    boss._children = [process.child]
+    process.report(1)
+    boss._listen(0.0)
+    boss._settle_jobs(process.child, UNHEARD)
+    assert back == [({"fit_set": "1"}, "the process that it was forked from has ended")]
 
 
 def test_a_full_gpu_does_not_keep_a_worker_whose_other_processes_have_ended(tmp_path: Path, limits: Limits):

@@ -7,12 +7,13 @@ import signal
 from pbl_pipeline.resources import fewer_collections
 
 fewer_collections()
-# A terminal and systemd send them to all processes; the supervisor decides.
-for _sent in (signal.SIGINT, signal.SIGTERM):
-    signal.signal(_sent, signal.SIG_IGN)
+# A terminal and systemd send them to all processes; the supervisor decides. What it sends to a copy waits for `begin`.
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 import pbl_pipeline.pipeline
 import pbl_workers.loop
+import pbl_workers.process
 import pbl_workers.selftest
 
 gc.freeze()  # their pages stay shared: the collector writes to each object that it looks at

@@ -32,7 +32,10 @@ log = logging.getLogger("pbl.worker")
 SELFTEST_FAILED = 3
 #: Exit code of a process whose GPU does not compute, such as one without free memory.
 DEVICE_FAILED = 4
+#: Exit code that `multiprocessing` states of a process whose end the one it was forked from cannot tell any more.
+UNHEARD = 255
 _PR_SET_PDEATHSIG = 1  # of Linux' prctl.h
+_LOADED_IN = os.getpid()  # of a forked process: the one that it was forked from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +112,9 @@ def begin(given: dict[str, str], target: Callable[..., None], options: Options, 
     the one that it was forked from, as the supervisor hears from that one how it ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # that one ignores it
+        if os.getpid() != _LOADED_IN != os.getppid():  # it has ended already
+            os._exit(UNHEARD)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ |= given
     target(options, pipe)
 

@@ -47,7 +47,8 @@ class Work:
     """A task in the queue."""
 
     def __init__(self, begin: Callable[[Any], Future[Path | None]]) -> None:
-        self._done = multiprocessing.get_context("spawn").Value("d", 0.0)
+        # A lock would start a process, which imports from the current folder.
+        self._done = multiprocessing.get_context("spawn").Value("d", 0.0, lock=False)
         self._future = begin(self._done)
 
     @property

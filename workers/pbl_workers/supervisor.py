@@ -35,7 +35,7 @@ from . import queue, recover, registry, run_job
 from .heartbeat import Heartbeat, Silent
 from .log import event
 from .metrics import Metrics
-from .process import DEVICE_FAILED, SELFTEST_FAILED, Options, begin, work
+from .process import DEVICE_FAILED, SELFTEST_FAILED, UNHEARD, Options, begin, work
 from .queue import Claim
 from .run_job import Outcome
 
@@ -219,7 +219,8 @@ class Supervisor:
                 if signum == signal.SIGKILL:
                     child.why = "did not stop in time"
                 if child.process.is_alive():
-                    os.kill(child.process.pid, signum)
+                    with contextlib.suppress(ProcessLookupError):  # that it has ended is heard later
+                        os.kill(child.process.pid, signum)
 
     def _listen(self, seconds: float) -> None:
         speaking = [c for c in self._children if not c.pipe.closed]
@@ -246,7 +247,7 @@ class Supervisor:
                 first, _ = next(iter(late.values()))
                 child.why = f"time limit of {_limit_s(first, self.options.limit_factor):g} s"
                 child.jobs, child.overdue = late, True
-                os.kill(child.process.pid, signal.SIGKILL)
+                child.process.kill()
 
     def _reap(self) -> int:
         """Reap exited processes, handle their jobs, and replace those that should not have ended, each after the pause
@@ -295,12 +296,14 @@ class Supervisor:
 
     def _settle_jobs(self, child: _Child, exit_code: int) -> None:
         reason = child.why or _death(exit_code)
+        what = "job lost its process" if exit_code == UNHEARD else "job took its process down"
         for job, _ in child.jobs.values():
-            event(log, logging.ERROR, "job took its process down", reason=reason, about=str(job))
+            event(log, logging.ERROR, what, reason=reason, about=str(job))
             if child.overdue:
                 self._unsettled.append(partial(recover.overdue, job, _limit_s(job, self.options.limit_factor)))
-            elif self._stopping:
-                self._unsettled.append(partial(queue.put_back, job, "the worker was stopped"))
+            elif self._stopping or exit_code == UNHEARD:
+                why = "the worker was stopped" if self._stopping else reason
+                self._unsettled.append(partial(queue.put_back, job, why))
             else:
                 self._unsettled.append(partial(recover.crashed, job, reason))
         self._settle()
@@ -321,7 +324,11 @@ def _limit_s(job: Claim, factor: float) -> float:
     return registry.stage_of(job.table).limit_s * factor
 
 
-_EXITS = {SELFTEST_FAILED: "its self-test failed", DEVICE_FAILED: "its GPU does not compute, or has no memory free"}
+_EXITS = {
+    SELFTEST_FAILED: "its self-test failed",
+    DEVICE_FAILED: "its GPU does not compute, or has no memory free",
+    UNHEARD: "the process that it was forked from has ended",
+}
 
 
 def _death(exit_code: int) -> str:

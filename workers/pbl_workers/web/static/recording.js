@@ -46,7 +46,7 @@ class Clock {
     };
     video.requestVideoFrameCallback(shown);
     // Of two seeks within milliseconds Chromium at times tells the first frame only, and shows the second (version 150).
-    video.addEventListener("seeked", () => { if (video.paused && !video.seeking) this.#at(frameAt(this.times, video.currentTime)); });
+    video.addEventListener("seeked", () => { if (this.video === video && video.paused && !video.seeking) this.#at(frameAt(this.times, video.currentTime)); });
     for (const name of ["play", "pause", "ended"]) video.addEventListener(name, () => { this.playing = !video.paused; this.changed(); });
   }
 
