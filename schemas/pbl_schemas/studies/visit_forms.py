@@ -38,18 +38,8 @@ ACTIVITY, PACE = "activity:", "pace:"
 #: Fields that are numbers, and their checks.
 _NUMBERS = {"height_m": check_height, "mass_kg": check_mass}
 #: Kind of decision by the first part of a field's name.
-_KINDS = {
-    "date": "date",
-    "height_m": "height",
-    "mass_kg": "mass",
-    "population": "population",
-    "assistive_device": "aid",
-    "orthosis": "orthosis",
-    "activity": "activity",
-    "pace": "pace",
-}
-
-
+_KINDS = {name: name for name in ("date", "population", "orthosis", "activity", "pace")}
+_KINDS |= {"height_m": "height", "mass_kg": "mass", "assistive_device": "aid"}
 #: Name of the field of the role; those of scores are named by their instruments.
 ROLE = "role"
 #: Roles that are offered; any word of small letters, digits and underscores can be one.
