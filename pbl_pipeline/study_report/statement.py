@@ -104,10 +104,8 @@ def _excluded(study: StudyData, results: StudyResults) -> Iterator[tuple[str, st
 def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
     yield (
         "Reliability",
-        (
-            "ICC(2,1) of visits, two-way random effects, absolute agreement, single visit, with its 95 % generalized "
-            "interval; of the cycles of one visit ICC(2,1)"
-        ),
+        "ICC(2,1) of visits, two-way random effects, absolute agreement, single visit, with its 95 % generalized "
+        "interval; of the cycles of one visit ICC(2,1)",
     )
     yield (
         "Error",
@@ -116,10 +114,8 @@ def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
     change = results.plan
     yield (
         "Assumption",
-        (
-            f"persons do not change between visits; where they do ({change.change_group}, "
-            f"{role_words(change.change_from)} to {role_words(change.change_to) or 'no other'}), that counts as error"
-        ),
+        f"persons do not change between visits; where they do ({change.change_group}, "
+        f"{role_words(change.change_from)} to {role_words(change.change_to) or 'no other'}), that counts as error",
     )
 
 
