@@ -145,12 +145,10 @@ def joined(texts: Iterable[str], between: str = ", ") -> Said:
 
 def said_of(data: Any) -> str:
     """Return the text that `Said.data` or a text became in JSON; of anything else its text."""
-    try:
+    with contextlib.suppress(AttributeError, IndexError, KeyError, TypeError, ValueError):
         places = [name for _, name, _, _ in string.Formatter().parse(data["says"]) if name is not None]
         if all(map(str.isidentifier, places)):
             return _said(data["says"], {k: said_of(v) if isinstance(v, dict) else v for k, v in data["of"].items()})
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-        pass
     return str(data)
 
 

@@ -271,10 +271,7 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
     columns = [
         *_scope([(scope, trial) for scope, trial, *_ in found]),
         Column(
-            "measure",
-            Texts.of([r[2] for r in found]),
-            "",
-            "docs/measures.md, kinetics.md; gvs: score of one angle",
+            "measure", Texts.of([r[2] for r in found]), "", "docs/measures.md, kinetics.md; gvs: score of one angle"
         ),
         Column("statistic", Texts.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
         Column("value", _floats(r[4] for r in found), "column unit", "missing where it cannot be trusted"),
