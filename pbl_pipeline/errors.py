@@ -244,6 +244,16 @@ def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -
         raise PblError(code, error.strerror or str(error), expected, next_step, key) from error
 
 
+@contextlib.contextmanager
+def suppress_codes(*codes: str) -> Iterator[None]:
+    """End the block where it raises a `PblError` of one of these codes, as `contextlib.suppress` does."""
+    try:
+        yield
+    except PblError as error:
+        if error.code not in codes:
+            raise
+
+
 def unread_file(error: Exception, expected: str, next_step: str, key: object) -> PblError:
     """The error for a file that could not be read: FILE_MISSING where it is absent or barred, else FILE_FORMAT."""
     absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import suppress_codes
 
 from . import fit_sets as fit
 from . import keypoints, session, tracking, video
@@ -41,12 +41,9 @@ def unsuited(fit_method: str, keypoint_method: str | None) -> str:
     if keypoint_method is None:
         return compare(name, None)
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
-    try:
+    with suppress_codes("MODEL_MISSING", "MODEL_INVALID"):
         return compare(name, methods.stored(**row).params.points())
-    except PblError as error:
-        if error.code not in ("MODEL_MISSING", "MODEL_INVALID"):
-            raise
-        return ""
+    return ""
 
 
 def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:
