@@ -50,9 +50,7 @@ class Videos:
     """
 
     def __init__(self) -> None:
-        self._open: collections.OrderedDict[tuple[int, str], tuple[Path, contextlib.ExitStack]] = (
-            collections.OrderedDict()
-        )
+        self._open = collections.OrderedDict[tuple[int, str], tuple[Path, contextlib.ExitStack]]()
         self._lock = threading.Lock()
 
     def path(self, video_id: int) -> Path:
