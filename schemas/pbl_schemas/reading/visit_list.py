@@ -150,9 +150,8 @@ def choices() -> dict[str, list[str]]:
 def earlier_result(session_id: int) -> Result | None:
     """Return the newest result of a part of the recordings that a current set of the visit has; None without one."""
     videos = fit.FitSet.Video & (fit.FitSet & {"session_id": session_id}).proj()
-    members: dict[str, set[int]] = {}
-    for row in videos.proj().to_dicts():
-        members.setdefault(row["fit_set"], set()).add(int(row["video_id"]))
+    of_sets = grouped((row["fit_set"], int(row["video_id"])) for row in videos.proj().to_dicts())
+    members = {name: set(own) for name, own in of_sets.items()}
     now = [members[name] for name in set((fit.current() & inside("fit_set", members)).to_arrays("fit_set"))]
     older = [name for name, own in members.items() if any(own < every for every in now)]
     return next(iter(results_of([session_id], older)[session_id]), None) if older else None
