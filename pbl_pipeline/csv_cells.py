@@ -44,13 +44,9 @@ def _mapped(frame: Any, change: Any) -> Any:
     for i, dtype in enumerate(frame.dtypes):
         if dtype.kind not in "biufcmM":
             texts = [change(v) if isinstance(v, str) else v for v in frame.iloc[:, i]]
-            out.isetitem(i, type(frame.iloc[:, i])(texts, index=frame.index, dtype=_dtype(dtype)))
+            kind = object if dtype.name == "category" else dtype  # changed categories are texts
+            out.isetitem(i, type(frame.iloc[:, i])(texts, index=frame.index, dtype=kind))
     return out
-
-
-def _dtype(dtype: Any) -> Any:
-    """Return the type of a changed column: categories become texts."""
-    return object if dtype.name == "category" else dtype
 
 
 def _computed(text: str) -> bool:

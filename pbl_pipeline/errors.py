@@ -145,12 +145,10 @@ def joined(texts: Iterable[str], between: str = ", ") -> Said:
 
 def said_of(data: Any) -> str:
     """Return the text that `Said.data` or a text became in JSON; of anything else its text."""
-    try:
+    with contextlib.suppress(AttributeError, IndexError, KeyError, TypeError, ValueError):
         places = [name for _, name, _, _ in string.Formatter().parse(data["says"]) if name is not None]
         if all(map(str.isidentifier, places)):
             return _said(data["says"], {k: said_of(v) if isinstance(v, dict) else v for k, v in data["of"].items()})
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-        pass
     return str(data)
 
 
@@ -244,6 +242,16 @@ def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -
         yield
     except OSError as error:
         raise PblError(code, error.strerror or str(error), expected, next_step, key) from error
+
+
+@contextlib.contextmanager
+def suppress_codes(*codes: str) -> Iterator[None]:
+    """End the block where it raises a `PblError` of one of these codes, as `contextlib.suppress` does."""
+    try:
+        yield
+    except PblError as error:
+        if error.code not in codes:
+            raise
 
 
 def unread_file(error: Exception, expected: str, next_step: str, key: object) -> PblError:

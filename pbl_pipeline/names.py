@@ -83,29 +83,24 @@ def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
 
 #: Masses (kg) of people who walk, with room to spare.
 MASS_KG = (5.0, 400.0)
-
-
-def check_mass(mass_kg: float | None) -> None:
-    """Raise `PblError` FIT_INPUT unless it is the mass of a person in kilograms."""
-    if mass_kg is not None and not MASS_KG[0] <= mass_kg <= MASS_KG[1]:
-        raise PblError(
-            "FIT_INPUT",
-            found=f"a body mass of {mass_kg:g} kg",
-            expected=f"kilograms, {MASS_KG[0]:g} to {MASS_KG[1]:g}",
-            next_step="state the mass in kilograms, such as 68.5, or leave it out",
-        )
-
-
 #: Heights (m) of people, the smallest walking child and the tallest adult with room to spare.
 HEIGHT_M = (0.5, 2.6)
 
 
+def check_mass(mass_kg: float | None) -> None:
+    """Raise `PblError` FIT_INPUT unless it is the mass of a person in kilograms."""
+    _check_size("mass", mass_kg, MASS_KG, "kg", "kilograms", 68.5)
+
+
 def check_height(height_m: float | None) -> None:
     """Raise `PblError` FIT_INPUT unless it is the height of a person in metres."""
-    if height_m is not None and not HEIGHT_M[0] <= height_m <= HEIGHT_M[1]:
-        raise PblError(
-            "FIT_INPUT",
-            found=f"a body height of {height_m:g} m",
-            expected=f"metres, {HEIGHT_M[0]} to {HEIGHT_M[1]}",
-            next_step="state the height in metres, such as 1.72, or leave it out",
-        )
+    _check_size("height", height_m, HEIGHT_M, "m", "metres", 1.72)
+
+
+def _check_size(
+    what: str, value: float | None, bounds: tuple[float, float], unit: str, units: str, such_as: float
+) -> None:
+    if value is not None and not bounds[0] <= value <= bounds[1]:
+        found, expected = f"a body {what} of {value:g} {unit}", f"{units}, {bounds[0]:g} to {bounds[1]:g}"
+        next_step = f"state the {what} in {units}, such as {such_as:g}, or leave it out"
+        raise PblError("FIT_INPUT", found, expected, next_step)

@@ -115,14 +115,8 @@ def run_visit(
     if sensors:
         more = {"sensors": sensors, "sensor_clock_s": places(sensors, recorded, points)}
     more |= {"depths": depths} if any(d is not None for d in depths) else {}
-    fit = fit_session(
-        points,
-        [r.name for r in recordings],
-        method,
-        camera_motion,
-        height_m=height_m,
-        **more,
-    )
+    names = [r.name for r in recordings]
+    fit = fit_session(points, names, method, camera_motion, height_m=height_m, **more)
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
     left_out = [r for r in found if r.problem]
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}

@@ -218,14 +218,8 @@ def deidentify(
     status, reason = _status(heads, reasons)
     sidecar = sidecar_of(out)
     with complete_file(out) as part, complete_file(sidecar) as part_of_sidecar:
-        write_h264(
-            part,
-            _pictures(video, info, heads, how),
-            (info.width_px, info.height_px),
-            info.time_s,
-            _QUALITY,
-            _kept(video, keep),
-        )
+        pictures, size = _pictures(video, info, heads, how), (info.width_px, info.height_px)
+        write_h264(part, pictures, size, info.time_s, _QUALITY, _kept(video, keep))
         done = Deidentified(out, sidecar, how, len(heads.heads), status, reason, reasons)
         content = _content(done, info, sha256_of(part), params, keep)
         part_of_sidecar.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

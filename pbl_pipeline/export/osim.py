@@ -99,11 +99,9 @@ def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title:
     bodies = (_body(body, i, own[i], known) for i in range(len(body.body_names)))
     root = ET.Element("OpenSimDocument", Version="40000")
     model = ET.SubElement(root, "Model", name=title)
-    _text(model, "credits", "; ".join(f"{k}: {v}" for k, v in origin.items()))
-    _text(model, "publications", "Hamner, Seth & Delp 2010, J Biomech 43:2709 (figures of the unscaled body)")
-    _text(model, "length_units", "meters")
-    _text(model, "force_units", "N")
-    _text(model, "gravity", "0 -9.80665 0")
+    published = "Hamner, Seth & Delp 2010, J Biomech 43:2709 (figures of the unscaled body)"
+    _texts(model, credits="; ".join(f"{k}: {v}" for k, v in origin.items()), publications=published)
+    _texts(model, length_units="meters", force_units="N", gravity="0 -9.80665 0")
     _objects(model, "BodySet", "bodyset", bodies)
     _objects(model, "JointSet", "jointset", (_joint(body, i, own) for i in range(len(body.body_names))))
     places = site_positions(markers, fit, body.scale_index)
@@ -136,9 +134,8 @@ def _body(body: Body, index: int, scale: float, known: tuple[float, Inertia] | N
     if known is not None:
         kg, own = known
         mass, centre, inertia = kg * own.mass[index], own.centre_m[index], kg * np.diag(own.moment_m2[index])
-    _text(element, "mass", _number(mass))
-    _text(element, "mass_center", _vector(centre))
-    _text(element, "inertia", _vector([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]))
+    moments = _vector([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])
+    _texts(element, mass=_number(mass), mass_center=_vector(centre), inertia=moments)
     return element
 
 
@@ -162,12 +159,10 @@ def _shape(model: mujoco.MjModel, geom: int, scale: float, turn: np.ndarray) -> 
         size = np.array([size[0], size[0], size[1] + size[0]])
     frame = ET.Element("PhysicalOffsetFrame", name=f"{name}_frame")
     shape = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Ellipsoid", name=f"{name}_shape")
-    _text(shape, "socket_frame", "..")
-    _text(ET.SubElement(shape, "Appearance"), "color", "0.55 0.68 0.85")
-    _text(shape, "radii", _vector(scale * size))
-    _text(frame, "socket_parent", "..")
-    _text(frame, "translation", _vector(scale * model.geom_pos[geom]))
-    _text(frame, "orientation", _vector(turn))
+    _texts(shape, socket_frame="..")
+    _texts(ET.SubElement(shape, "Appearance"), color="0.55 0.68 0.85")
+    _texts(shape, radii=_vector(scale * size))
+    _texts(frame, socket_parent="..", translation=_vector(scale * model.geom_pos[geom]), orientation=_vector(turn))
     return frame
 
 
@@ -177,17 +172,15 @@ def _joint(body: Body, index: int, own_scale: np.ndarray) -> ET.Element:
     base, *side = child.rsplit("_", 1)
     element = ET.Element("CustomJoint", name="_".join([_JOINTS.get(base, f"{base}_joint"), *side]))
     offset = f"{body.body_names[parent] if parent >= 0 else 'ground'}_offset"
-    _text(element, "socket_parent_frame", offset)
-    _text(element, "socket_child_frame", f"/bodyset/{child}")
+    _texts(element, socket_parent_frame=offset, socket_child_frame=f"/bodyset/{child}")
     element.append(coordinates)
     frame = ET.SubElement(ET.SubElement(element, "frames"), "PhysicalOffsetFrame", name=offset)
     place, turn = np.zeros(3), np.zeros(3)
     if parent >= 0:  # the position of the root at qpos 0 is part of its coordinates
         place = own_scale[parent] * model.body_pos[index + 1]
         turn = Rotation.from_quat(model.body_quat[index + 1], scalar_first=True).as_euler("XYZ")
-    _text(frame, "socket_parent", f"/bodyset/{body.body_names[parent]}" if parent >= 0 else "/ground")
-    _text(frame, "translation", _vector(place))
-    _text(frame, "orientation", _vector(turn))
+    socket = f"/bodyset/{body.body_names[parent]}" if parent >= 0 else "/ground"
+    _texts(frame, socket_parent=socket, translation=_vector(place), orientation=_vector(turn))
     element.append(transform)
     return element
 
@@ -232,32 +225,23 @@ def _coordinate(body: Body, joint: int) -> ET.Element:
         low = -high
     element = ET.Element("Coordinate", name=body.joint_names[joint])
     rest = pelvis_rest_m(body).get(body.joint_names[joint], 0.0)
-    for name, text in (
-        ("default_value", _number(rest)),
-        ("default_speed_value", "0"),
-        ("range", _vector([low, high])),
-        ("clamped", "false"),
-        ("locked", "false"),
-    ):
-        _text(element, name, text)
+    _texts(element, default_value=_number(rest), default_speed_value="0", range=_vector([low, high]))
+    _texts(element, clamped="false", locked="false")
     return element
 
 
 def _axis(transform: ET.Element, name: str, axis: np.ndarray, coordinate: str | None) -> None:
     element = ET.SubElement(transform, "TransformAxis", name=name)
-    _text(element, "coordinates", coordinate or "")
-    _text(element, "axis", _vector(axis))
+    _texts(element, coordinates=coordinate or "", axis=_vector(axis))
     if coordinate is None:
-        _text(ET.SubElement(element, "Constant", name="function"), "value", "0")
+        _texts(ET.SubElement(element, "Constant", name="function"), value="0")
     else:
-        _text(ET.SubElement(element, "LinearFunction", name="function"), "coefficients", "1 0")
+        _texts(ET.SubElement(element, "LinearFunction", name="function"), coefficients="1 0")
 
 
 def _marker(name: str, body_name: str, place_m: np.ndarray) -> ET.Element:
     element = ET.Element("Marker", name=name)
-    _text(element, "socket_parent_frame", f"/bodyset/{body_name}")
-    _text(element, "location", _vector(place_m))
-    _text(element, "fixed", "true")
+    _texts(element, socket_parent_frame=f"/bodyset/{body_name}", location=_vector(place_m), fixed="true")
     return element
 
 
@@ -281,8 +265,9 @@ def _objects(model: ET.Element, kind: str, name: str, members: Iterable[ET.Eleme
     ET.SubElement(ET.SubElement(model, kind, name=name), "objects").extend(members)
 
 
-def _text(parent: ET.Element, name: str, text: str) -> None:
-    ET.SubElement(parent, name).text = text
+def _texts(parent: ET.Element, **texts: str) -> None:
+    for name, text in texts.items():
+        ET.SubElement(parent, name).text = text
 
 
 def _vector(values: Iterable[float]) -> str:

@@ -230,15 +230,8 @@ class _Part(NamedTuple):
     kinetics: Kinetics | None = None
 
 
-#: Statistic of a measure of forces -> attribute of `KineticMeasure`.
-_OF_FORCES = {
-    "mean": "mean",
-    "left": "left",
-    "right": "right",
-    "n": "n",
-    "error_sd": "sd",
-    "asymmetry_percent": "asymmetry_percent",
-}
+#: Statistics of a measure of forces; `KineticMeasure` has `error_sd` as `sd`.
+_OF_FORCES = ("mean", "left", "right", "n", "error_sd", "asymmetry_percent")
 
 
 def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
@@ -269,7 +262,7 @@ def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
         if measure is None:
             yield name, "mean", np.nan, kinetics.reasons.get(name, "")
             continue
-        found = {s: getattr(measure, attribute) for s, attribute in _OF_FORCES.items()}
+        found = {s: getattr(measure, "sd" if s == "error_sd" else s) for s in _OF_FORCES}
         yield from ((name, s, float(v), "") for s, v in found.items() if v is not None)
 
 
@@ -278,10 +271,7 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
     columns = [
         *_scope([(scope, trial) for scope, trial, *_ in found]),
         Column(
-            "measure",
-            Texts.of([r[2] for r in found]),
-            "",
-            "docs/measures.md, kinetics.md; gvs: score of one angle",
+            "measure", Texts.of([r[2] for r in found]), "", "docs/measures.md, kinetics.md; gvs: score of one angle"
         ),
         Column("statistic", Texts.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
         Column("value", _floats(r[4] for r in found), "column unit", "missing where it cannot be trusted"),

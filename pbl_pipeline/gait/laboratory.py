@@ -162,10 +162,8 @@ def _read(
         kept = [p for p in there if not p[0] or person is None or _key(p[0]) == _key(person)]
         names = [name for _, name, _ in kept]
         if twice := [n for n in dict.fromkeys(names) if names.count(n) > 1]:
-            found, advice = (
-                f"more than one point named {', '.join(twice)}",
-                "rename or remove all but one, and export again",
-            )
+            found = f"more than one point named {', '.join(twice)}"
+            advice = "rename or remove all but one, and export again"
             raise PblError("FILE_FORMAT", found, "each point once", advice, key=path)
         xyz = file.points([i for _, _, i in kept])
     if not len(xyz):

@@ -87,9 +87,8 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
         _check_gravity(acceleration, refuse)
         if turns is not None:
             _check_upright(turns, acceleration, refuse)
-    rate, acceleration = (
-        _unclipped(x, *_CLIPS[k], notes, refuse) for k, x in (("rate", rate), ("acceleration", acceleration))
-    )
+    rate = _unclipped(rate, *_CLIPS["rate"], notes, refuse)
+    acceleration = _unclipped(acceleration, *_CLIPS["acceleration"], notes, refuse)
     if rate is not None:
         _check_rate(time, rate, acceleration, turns, refuse)
         _note_heading(time, rate, turns, notes)

@@ -30,7 +30,7 @@ from .figures import (
     draw_scatter,
 )
 from .page_tables import all_tables, number, p_said, p_text, short_of, title_of
-from .results import StudyResults, reason, score_classes, study_results
+from .results import COLUMNS, StudyResults, reason, score_classes, study_results
 from .statement import statement
 from .visit_values import INDEX, of_scores, pairs, plan
 
@@ -123,11 +123,7 @@ def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
     return {
         "visits": results.table,
         "flow": results.flow,
-        "by_visit": results.by_visit,
-        "repeatability": results.repeatability,
-        "validity": results.validity,
-        "change": results.change,
-        "groups": results.groups,
+        **{name: getattr(results, name) for name in COLUMNS},
         "curve_tests": pd.concat(rows) if rows else pd.DataFrame(columns=curve_columns),
     }
 

@@ -205,11 +205,8 @@ def table2(results: StudyResults) -> PageTable:
                 found = _one(results.validity, name=name, score=score, persons=persons)
                 text = _NONE
                 if found is not None:
-                    text = (
-                        marks(found["message"])
-                        if found["code"]
-                        else f"{number(found['value'], 2)}{'*' if found['p_holm'] < ALPHA else ''}"
-                    )
+                    star = "*" if found["p_holm"] < ALPHA else ""
+                    text = marks(found["message"]) if found["code"] else number(found["value"], 2) + star
                 several = len(persons_of.get(score, ())) > 1
                 row["Validity", f"r {short_of(score)}" + f", {persons}" * several] = text
             found = _one(results.change, name=name, statistic="effect_size")
@@ -384,9 +381,9 @@ def phases(results: StudyResults) -> PageTable:
 def comparison_of(result: Any) -> str:
     """Names of the compared groups or roles, as a - b."""
     a, b = result.names
-    return (
-        f"{role_words(a) or 'none'} {_MINUS} {role_words(b)}" if result.comparison == "change" else f"{a} {_MINUS} {b}"
-    )
+    if result.comparison == "change":
+        a, b = role_words(a) or "none", role_words(b)
+    return f"{a} {_MINUS} {b}"
 
 
 def _when(plan: Plan) -> str:

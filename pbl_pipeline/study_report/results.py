@@ -136,12 +136,11 @@ def flow_table(study: StudyData, to_compare: Plan) -> pd.DataFrame:
 def visit_means(table: pd.DataFrame, to_compare: Plan) -> pd.DataFrame:
     """Mean with its 95 % interval (Student's t), standard deviation, median and nIQR, by measure, group and role."""
     rows = []
-    for name in (*to_compare.measures, *to_compare.scores):
-        for group in to_compare.groups:
-            for role in to_compare.roles:
-                values = at_role(table, role, name, group).to_numpy(float)
-                if len(values):
-                    rows.append({"name": name, "group": group, "role": role, "n": len(values), **summary(values)})
+    names = (*to_compare.measures, *to_compare.scores)
+    for name, group, role in itertools.product(names, to_compare.groups, to_compare.roles):
+        values = at_role(table, role, name, group).to_numpy(float)
+        if len(values):
+            rows.append({"name": name, "group": group, "role": role, "n": len(values), **summary(values)})
     return pd.DataFrame(rows, columns=COLUMNS["by_visit"])
 
 
@@ -195,16 +194,15 @@ def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.Data
     ordinal = of_scores(study, "ordinal")
     at: Any = table[table["role"] == to_compare.change_from]
     rows = []
-    for name in to_compare.measures:
-        for score in to_compare.scores:
-            both = at.dropna(subset=[name, score])
-            own = both[both["group"] == to_compare.change_group]
-            parts = {"all": both} if len(own) in (0, len(both)) else {"all": both, to_compare.change_group: own}
-            for persons, part in parts.items():
-                kind = "spearman" if ordinal[score] else "pearson"
-                found, why = _tried(correlation, part[name], part[score], kind)
-                about = {"name": name, "score": score, "persons": persons, "kind": kind, "n": len(part)}
-                rows.append({**about, **_fields(found, *_INTERVAL, "p"), **why})
+    for name, score in itertools.product(to_compare.measures, to_compare.scores):
+        both = at.dropna(subset=[name, score])
+        own = both[both["group"] == to_compare.change_group]
+        parts = {"all": both} if len(own) in (0, len(both)) else {"all": both, to_compare.change_group: own}
+        for persons, part in parts.items():
+            kind = "spearman" if ordinal[score] else "pearson"
+            found, why = _tried(correlation, part[name], part[score], kind)
+            about = {"name": name, "score": score, "persons": persons, "kind": kind, "n": len(part)}
+            rows.append({**about, **_fields(found, *_INTERVAL, "p"), **why})
     return _corrected(pd.DataFrame(rows, columns=COLUMNS["validity"]), "persons")
 
 
@@ -235,20 +233,19 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
     rows = []
     for by, labels in kinds.items():
         names = list(to_compare.groups) if by == "group" else list(labels.cat.categories)
-        others = list(itertools.combinations(names, 2) if by == "group" else itertools.pairwise(names))
-        for name in to_compare.measures:
-            for a, b in others:
-                x, y = (at.loc[labels == v, name].dropna().to_numpy(float) for v in (a, b))
-                if not len(x) or not len(y):
-                    continue
-                test, why = _tried(compare_groups, x, y)
-                size, _ = _tried(hedges_g, x, y)
-                row = {"name": name, "by": by, "a": a, "b": b, "test": "", "n_a": len(x), "n_b": len(y), **why}
-                if test is not None:
-                    row |= {"test": test.name, "statistic": test.statistic, "p": test.p}
-                if test is not None and size is not None:
-                    row |= {"g": size.value, "g_low": size.low, "g_high": size.high}
-                rows.append(row)
+        others = itertools.combinations(names, 2) if by == "group" else itertools.pairwise(names)
+        for name, (a, b) in itertools.product(to_compare.measures, others):
+            x, y = (at.loc[labels == v, name].dropna().to_numpy(float) for v in (a, b))
+            if not len(x) or not len(y):
+                continue
+            test, why = _tried(compare_groups, x, y)
+            size, _ = _tried(hedges_g, x, y)
+            row = {"name": name, "by": by, "a": a, "b": b, "test": "", "n_a": len(x), "n_b": len(y), **why}
+            if test is not None:
+                row |= {"test": test.name, "statistic": test.statistic, "p": test.p}
+            if test is not None and size is not None:
+                row |= {"g": size.value, "g_low": size.low, "g_high": size.high}
+            rows.append(row)
     return _corrected(pd.DataFrame(rows, columns=COLUMNS["groups"]), "by")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,8 @@ def _measurement(study: StudyData) -> Iterator[tuple[str, str]]:
     for column, item in FILMED.items():
         if column in counted:
             values = counted[column].fillna("").astype(str).str.strip()
-            yield item, _counts(v or _NOT_STATED for v in values)
+            counts = Counter(v or _NOT_STATED for v in values)
+            yield item, "; ".join(f"{value}: {n}" for value, n in counts.most_common())
     cycles = counted["n_cycles"].dropna()
     yield "Gait cycles of a visit", _spread(cycles, "")
 
@@ -104,10 +105,8 @@ def _excluded(study: StudyData, results: StudyResults) -> Iterator[tuple[str, st
 def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
     yield (
         "Reliability",
-        (
-            "ICC(2,1) of visits, two-way random effects, absolute agreement, single visit, with its 95 % generalized "
-            "interval; of the cycles of one visit ICC(2,1)"
-        ),
+        "ICC(2,1) of visits, two-way random effects, absolute agreement, single visit, with its 95 % generalized "
+        "interval; of the cycles of one visit ICC(2,1)",
     )
     yield (
         "Error",
@@ -116,10 +115,8 @@ def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
     change = results.plan
     yield (
         "Assumption",
-        (
-            f"persons do not change between visits; where they do ({change.change_group}, "
-            f"{role_words(change.change_from)} to {role_words(change.change_to) or 'no other'}), that counts as error"
-        ),
+        f"persons do not change between visits; where they do ({change.change_group}, "
+        f"{role_words(change.change_from)} to {role_words(change.change_to) or 'no other'}), that counts as error",
     )
 
 
@@ -152,10 +149,6 @@ def _spread(values: Any, unit: str) -> str:
     digits = 0 if (np.asarray(values) % 1 == 0).all() else 1
     low, middle, high = (number(float(v), digits) for v in (values.min(), values.median(), values.max()))
     return f"median {middle} (range {low} to {high}) {unit}".rstrip() + f", n {len(values)}"
-
-
-def _counts(values: Iterable[str]) -> str:
-    return "; ".join(f"{value}: {n}" for value, n in Counter(values).most_common())
 
 
 def _reasons(counts: Counter[str]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 from pbl_pipeline.errors import PblError
 
@@ -79,73 +78,36 @@ def style_of(impairments: tuple[Impairment, ...]) -> Style:
     """Combine impairments into a style, in their order."""
     style = Style()
     for i in impairments:
-        IMPAIRMENTS[i.name](style, i.severity, i.letters)
+        for field, (added, changed) in IMPAIRMENTS[i.name].items():
+            more, factor = added * i.severity, 1 + changed * i.severity
+            value = getattr(style, field)
+            if isinstance(value, dict):
+                value.update({side: value[side] * factor + more for side in i.letters})
+            else:
+                setattr(style, field, value * factor + more)
     return style
 
 
-def _crouch(style: Style, s: float, sides: str) -> None:
-    for side in sides:
-        style.stance_knee[side] += 32 * s
-        style.stance_hip[side] += 18 * s
-        style.stance_ankle[side] += 13 * s
-    style.step_length *= 1 - 0.15 * s
-
-
-def _stiff_knee(style: Style, s: float, sides: str) -> None:
-    for side in sides:
-        style.swing_knee[side] *= 1 - 0.7 * s
-        style.swing_abduction[side] += 10 * s
-        style.swing_hike[side] += 5 * s
-    style.step_length *= 1 - 0.1 * s
-
-
-def _drop_foot(style: Style, s: float, sides: str) -> None:
-    for side in sides:
-        style.swing_ankle[side] -= 22 * s
-        style.swing_hip[side] += 12 * s
-        style.swing_more_knee[side] += 16 * s
-        style.forefoot[side] = max(style.forefoot[side], s)
-
-
-def _short_steps(style: Style, s: float, sides: str) -> None:
-    style.step_length *= 1 - 0.5 * s
-    style.cadence *= 1 + 0.05 * s
-    for side in sides:
-        style.arm_swing[side] *= 1 - 0.6 * s
-
-
-def _weakness(style: Style, s: float, sides: str) -> None:
-    for side in sides:
-        style.late_down[side] += 0.06 * s
-        style.swing_knee[side] *= 1 - 0.35 * s
-        style.swing_ankle[side] -= 8 * s
-        style.swing_abduction[side] += 5 * s
-        style.swing_hike[side] += 3 * s
-        style.arm_swing[side] *= 1 - 0.8 * s
-        style.elbow[side] += 45 * s
-    style.step_length *= 1 - 0.2 * s
-    style.cadence *= 1 - 0.12 * s
-
-
-def _trunk_sway(style: Style, s: float, sides: str) -> None:
-    style.trunk_sway += 14 * s
-    style.sway_m += 0.015 * s
-
-
-def _widened_base(style: Style, s: float, sides: str) -> None:
-    style.width_m += 0.16 * s
-    style.sway_m += 0.02 * s
-    style.step_length *= 1 - 0.1 * s
-
-
-IMPAIRMENTS: dict[str, Callable[[Style, float, str], None]] = {
-    "crouch": _crouch,
-    "stiff_knee": _stiff_knee,
-    "drop_foot": _drop_foot,
-    "short_steps": _short_steps,
-    "weakness": _weakness,
-    "trunk_sway": _trunk_sway,
-    "widened_base": _widened_base,
+#: What an impairment of severity 1 adds to fields of `Style`, and by which fraction it changes them: of the affected
+#: sides where the field has two.
+IMPAIRMENTS: dict[str, dict[str, tuple[float, float]]] = {
+    "crouch": {"stance_knee": (32, 0), "stance_hip": (18, 0), "stance_ankle": (13, 0), "step_length": (0, -0.15)},
+    "stiff_knee": {"swing_knee": (0, -0.7), "swing_abduction": (10, 0), "swing_hike": (5, 0), "step_length": (0, -0.1)},
+    "drop_foot": {"swing_ankle": (-22, 0), "swing_hip": (12, 0), "swing_more_knee": (16, 0), "forefoot": (1, 0)},
+    "short_steps": {"step_length": (0, -0.5), "cadence": (0, 0.05), "arm_swing": (0, -0.6)},
+    "weakness": {
+        "late_down": (0.06, 0),
+        "swing_knee": (0, -0.35),
+        "swing_ankle": (-8, 0),
+        "swing_abduction": (5, 0),
+        "swing_hike": (3, 0),
+        "arm_swing": (0, -0.8),
+        "elbow": (45, 0),
+        "step_length": (0, -0.2),
+        "cadence": (0, -0.12),
+    },
+    "trunk_sway": {"trunk_sway": (14, 0), "sway_m": (0.015, 0)},
+    "widened_base": {"width_m": (0.16, 0), "sway_m": (0.02, 0), "step_length": (0, -0.1)},
 }
 #: Impairments that may be on one side, and those of them that are on the right side by default.
 SIDED = ("crouch", "stiff_knee", "drop_foot", "weakness")

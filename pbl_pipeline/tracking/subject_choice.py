@@ -40,10 +40,8 @@ def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[
     if not people:
         raise ValueError("a contact sheet needs at least one person")
     moments = _moments(people, tracking)
-    cells = []
-    for frame in read_frames(video_path, start=min(moments), stop=max(moments) + 1):
-        if frame.index in moments:
-            cells.append(_cell(frame.image, people, tracking, frame.index))
+    frames = read_frames(video_path, start=min(moments), stop=max(moments) + 1)
+    cells = [_cell(f.image, people, tracking, f.index) for f in frames if f.index in moments]
     columns = min(math.ceil(math.sqrt(len(cells))), _COLUMNS)
     cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
     rows = [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]

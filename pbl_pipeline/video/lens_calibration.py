@@ -271,10 +271,7 @@ def about_phone(video: VideoInfo) -> dict[str, Any]:
     return {
         "video": {"name": Path(video.path).name, "sha256": video.sha256, "rotation_deg": video.rotation_deg},
         "phone": {
-            "make": video.make,
-            "model": video.model,
-            "lens": video.lens,
-            "focal_35mm": video.focal_35mm,
+            **{name: getattr(video, name) for name in ("make", "model", "lens", "focal_35mm")},
             "rate": None if lens is None else lens.rate,
         },
         "recorded_utc": video.recorded_utc,

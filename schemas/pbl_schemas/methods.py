@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pbl_pipeline import methods
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import suppress_codes
 
 from . import connection, fit, gait, gdi, keypoints, kinetics, study, tracking
 from .instruments import INSTRUMENTS
@@ -39,11 +39,8 @@ def insert_if_none() -> None:
     if connection.connect().query(f"SELECT {filled}").fetchone()[0]:
         add_instruments()
         return
-    try:
+    with suppress_codes("DB_REFUSED"):
         insert_once()
-    except PblError as error:
-        if error.code != "DB_REFUSED":
-            raise
 
 
 def insert_all() -> None:
@@ -66,11 +63,8 @@ def add_instruments() -> None:
     """
     there = set(study.ClinicalInstrument().to_arrays("instrument"))
     if lacking := [row for row in INSTRUMENTS if row["instrument"] not in there]:
-        try:
+        with suppress_codes("DB_REFUSED"):
             study.ClinicalInstrument.insert(lacking, skip_duplicates=True)
-        except PblError as error:
-            if error.code != "DB_REFUSED":
-                raise
 
 
 def _body() -> None:

@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import suppress_codes
 
 from . import fit_sets as fit
 from . import keypoints, session, tracking, video
 from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
-from .rows import inside, utc_now
+from .rows import grouped, inside, utc_now
 from .transactions import read_committed, repeated
 
 #: Columns of one fit: recordings of one kind of a session, seen through one chain of methods.
@@ -41,12 +41,9 @@ def unsuited(fit_method: str, keypoint_method: str | None) -> str:
     if keypoint_method is None:
         return compare(name, None)
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
-    try:
+    with suppress_codes("MODEL_MISSING", "MODEL_INVALID"):
         return compare(name, methods.stored(**row).params.points())
-    except PblError as error:
-        if error.code not in ("MODEL_MISSING", "MODEL_INVALID"):
-            raise
-        return ""
+    return ""
 
 
 def plan_fits(selected: Sequence[Mapping[str, Any]], fit_method: str) -> None:
@@ -210,9 +207,8 @@ def _plan_markers(session_id: int) -> list[dict[str, Any]]:
     """
     columns = ("recording_marker_set", "marker_table_sha256")
     videos = (video.Video.proj("session_id", "video_sha256") & {"session_id": session_id}) - video.NotUsable
-    by_method: dict[str, list[dict]] = defaultdict(list)
-    for row in (fit.MarkerPlan.proj() * video.MarkerRecording.proj(*columns) * videos).to_dicts(order_by="video_id"):
-        by_method[row["fit_method"]].append({**row, "tracking_method": None, "keypoint_method": None})
+    rows = (fit.MarkerPlan.proj() * video.MarkerRecording.proj(*columns) * videos).to_dicts(order_by="video_id")
+    by_method = grouped((r["fit_method"], {**r, "tracking_method": None, "keypoint_method": None}) for r in rows)
     made = []
     for method, rows in by_method.items():
         made += _make_set(dict(zip(GROUP, (session_id, None, None, method, fit.MARKERS), strict=True)), rows)

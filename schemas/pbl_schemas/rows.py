@@ -121,11 +121,17 @@ class ReadAhead:
         self, name: tuple, by: tuple[str, ...], read: Callable[[], list[dict[str, Any]]]
     ) -> dict[tuple, list[dict[str, Any]]]:
         if name not in self._tables:
-            groups: dict[tuple, list[dict[str, Any]]] = {} if by else {(): []}
-            for row in read():
-                groups.setdefault(tuple(row[c] for c in by), []).append(row)
-            self._tables[name] = groups
+            groups = grouped((tuple(row[c] for c in by), row) for row in read())
+            self._tables[name] = groups if groups or by else {(): []}
         return self._tables[name]
+
+
+def grouped(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, list[Any]]:
+    """Return the second ones of pairs in lists by the first, both in the order in which they come."""
+    out: dict[Any, list[Any]] = {}
+    for key, value in pairs:
+        out.setdefault(key, []).append(value)
+    return out
 
 
 def insert_in_parts(table: Any, rows: Iterable[Any], **options: Any) -> None:

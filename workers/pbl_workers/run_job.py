@@ -72,11 +72,9 @@ class Computed:
 
     def of(self, fetched: tuple) -> bool:
         """Return whether these inputs are the same."""
-        try:
+        with contextlib.suppress(ValueError):  # arrays among them have no one answer
             if bool(fetched == self.fetched):
                 return True
-        except ValueError:  # arrays among them have no one answer
-            pass
         # A hash takes milliseconds; it also finds two NaN alike.
         return deepdiff.DeepHash(fetched)[fetched] == deepdiff.DeepHash(self.fetched)[self.fetched]
 
@@ -261,11 +259,9 @@ def wait_for_database(
     stop, until = stop or threading.Event(), time.monotonic() + DATABASE_WAIT_S
     while time.monotonic() < until:
         if not pause:
-            try:
+            with contextlib.suppress(PblError, *DATABASE_ERRORS):
                 connection.connect()
                 return True
-            except (PblError, *DATABASE_ERRORS):
-                pass
         pause = False
         waiting()
         if stop.wait(DATABASE_PAUSE_S):

@@ -267,10 +267,8 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
 
 
 def _to_json(norm: NormativeSet, digits: int | None) -> dict:
-    out = {}
-    for field in dataclasses.fields(norm):
-        if field.name != "sha256":
-            out[field.name] = _plain(getattr(norm, field.name), digits)
+    names = (field.name for field in dataclasses.fields(norm))
+    out = {name: _plain(getattr(norm, name), digits) for name in names if name != "sha256"}
     # Left out where they are the default: the first set was written before there was another.
     for name, default in (("angle_model", PLUG_IN_GAIT), ("mapped_from", "")):
         if out[name] == default:

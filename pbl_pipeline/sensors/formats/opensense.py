@@ -11,10 +11,6 @@ import numpy as np
 from .samples import Format, LogFile, Samples, numbers, table
 
 
-def _knows(file: LogFile) -> bool:
-    return "DataType=Quaternion" in file.text[:8000]
-
-
 def _reads(file: LogFile) -> list[Samples]:
     lines = file.text[:8000].splitlines()
     end = next((i for i, line in enumerate(lines) if line.strip().lower() == "endheader"), 0)
@@ -34,4 +30,4 @@ def _reads(file: LogFile) -> list[Samples]:
     return out
 
 
-FORMAT = Format("OpenSense .sto", _knows, _reads)
+FORMAT = Format("OpenSense .sto", lambda file: "DataType=Quaternion" in file.text[:8000], _reads)

@@ -15,10 +15,6 @@ import numpy as np
 from .samples import Format, LogFile, Samples, numbers, table
 
 
-def _knows(file: LogFile) -> bool:
-    return _line(file)[1].lower().startswith("time_s")
-
-
 def _line(file: LogFile) -> tuple[int, str]:
     lines = file.text[:8000].splitlines()
     return next(((i, line.strip()) for i, line in enumerate(lines) if line.strip() and line[0] != "#"), (0, ""))
@@ -52,4 +48,4 @@ def _reads(file: LogFile) -> list[Samples]:
     return [Samples(file.stem, "UTC", start + stamp, rate, acceleration, turns, start_utc=0.0, mounting=mounting)]
 
 
-FORMAT = Format("CSV of this project", _knows, _reads)
+FORMAT = Format("CSV of this project", lambda file: _line(file)[1].lower().startswith("time_s"), _reads)

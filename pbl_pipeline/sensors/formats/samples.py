@@ -25,9 +25,8 @@ if TYPE_CHECKING:
 MAX_LOG = 4 * bounded.MAX_TEXT
 
 _NEXT = "export it again as docs/imu.md says, or leave this sensor out"
-log_error, unknown_error = (
-    functools.partial(PblError, code, next_step=_NEXT) for code in ("SENSOR_LOG", "FILE_FORMAT")
-)
+log_error = functools.partial(PblError, "SENSOR_LOG", next_step=_NEXT)
+unknown_error = functools.partial(PblError, "FILE_FORMAT", next_step=_NEXT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +91,7 @@ def opened(path: Path, rate_hz: float | None = None, called: str | None = None) 
         try:
             text = bounded.read_text(path, MAX_LOG)
         except ValueError as error:
-            raise unknown_error(
-                f"no text to read ({error})", "a log as docs/imu.md says", key=called or path
-            ) from error
+            raise unknown_error(f"no text to read ({error})", "a log as docs/imu.md says", key=name) from error
     if not text.strip():
         raise unknown_error("an empty file", "a log as docs/imu.md says", key=name)
     return LogFile(path, text, rate_hz, called)

@@ -52,9 +52,7 @@ def _reads(file: LogFile) -> list[Samples]:
         turns = turns[:, [1, 0, 3, 2]] * [-1, 1, -1, 1]  # half a turn about the world's x
     recording, device = m.groups() if (m := _DEVICE.fullmatch(file.stem)) else ("", file.stem)
     rate, acceleration = (numbers(file, found, [f"{what}_{axis}" for axis in "XYZ"]) for what in ("Gyr", "Acc"))
-    return [
-        Samples(device, f"Xsens {recording}", stamp, rate, acceleration, turns, None, counter, hz, wraps_s),
-    ]
+    return [Samples(device, f"Xsens {recording}", stamp, rate, acceleration, turns, None, counter, hz, wraps_s)]
 
 
 FORMAT = Format("Xsens MT Manager", _knows, _reads)

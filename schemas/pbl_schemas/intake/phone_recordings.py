@@ -250,10 +250,8 @@ def recordings(session_id: int) -> list[tuple[Sent, Usable | None]]:
 
 def log_missing(session_id: int, sent: list[tuple[Sent, Usable | None]]) -> bool:
     """Return whether sensors were worn, as a phone said, and the visit has none of their logs."""
-    said = any(one.about.get("worn") for one, _ in sent)
-    return (
-        said and not video.WearableImu & "imu_segments IS NOT NULL" & (video.Video & {"session_id": session_id}).proj()
-    )
+    own = (video.Video & {"session_id": session_id}).proj()
+    return any(one.about.get("worn") for one, _ in sent) and not video.WearableImu & "imu_segments IS NOT NULL" & own
 
 
 def filming(session_id: int) -> dict[str, Any]:

@@ -78,10 +78,9 @@ def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> lis
     of = collections.Counter((step, judged.activity, judged.state) for step, judged in once.values())
     out = []
     for step in _steps(links[0]["protocol"]):
-        usable, remarks, waiting = (
-            of[str(step.number), Condition(step.activity).activity, state] for state in (USABLE, REMARKS, PENDING)
-        )
-        out.append(dataclasses.replace(step, done=usable + remarks, waiting=waiting))
+        this = str(step.number), Condition(step.activity).activity
+        done = of[*this, USABLE] + of[*this, REMARKS]
+        out.append(dataclasses.replace(step, done=done, waiting=of[*this, PENDING]))
     return out
 
 

@@ -111,14 +111,9 @@ def _of_videos(
     if named & {"tracking_method", "keypoint_method"}:
         yield keypoints.KeypointSelection, [{**t, **points} for t in trackings]
     if named & {"keypoint_method", "fit_method"}:
-        yield (
-            fit.FitPlan,
-            [
-                {"session_id": s, "fit_method": chosen["fit_method"], "keypoint_method": method}
-                for s in sessions
-                for method in (points.values() if "keypoint_method" in named else _keypoint_methods(s))
-            ],
-        )
+        by = {"fit_method": chosen["fit_method"]}
+        methods = {s: points.values() if "keypoint_method" in named else _keypoint_methods(s) for s in sessions}
+        yield fit.FitPlan, [{"session_id": s, **by, "keypoint_method": m} for s, of in methods.items() for m in of]
 
 
 def _keypoint_methods(session_id: int) -> list[str]:

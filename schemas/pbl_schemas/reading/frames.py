@@ -34,12 +34,8 @@ _SESSION_COLUMNS = (
 
 def current_sets() -> Any:
     """Sets of recordings that are the newest of their session and kind, with subject and session."""
-    current = fit.current()
-    return (
-        current
-        * fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n")
-        * session.Session.proj("subject", "session_label", "session_date")
-    )
+    sets = fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n")
+    return fit.current() * sets * session.Session.proj("subject", "session_label", "session_date")
 
 
 def newest_sets() -> Any:

@@ -66,9 +66,8 @@ class ShownVisit:
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
     measures: Mapping[str, tuple[Measure | None, str]] = dataclasses.field(default_factory=dict)  # or why not known
-    tasks: Mapping[str, Mapping[str, tuple[Measure | None, str]]] = dataclasses.field(
-        default_factory=dict
-    )  # by recording
+    #: By recording.
+    tasks: Mapping[str, Mapping[str, tuple[Measure | None, str]]] = dataclasses.field(default_factory=dict)
     checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
     lacks: tuple[str, ...] = ()  # what its files lack
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person

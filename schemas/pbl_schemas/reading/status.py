@@ -18,7 +18,7 @@ from ..job_errors import error_code, stored_error
 from ..jobs import jobs_of
 from ..operations.archive import archive_dir, disks, unfinished
 from ..operations.catalog import quote
-from ..rows import rows_inside
+from ..rows import grouped, rows_inside
 
 #: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
@@ -463,9 +463,8 @@ def _waiting(most: int) -> list[Waiting]:
     rows = (found - video.NotUsable).to_dicts(order_by="video_id", limit=most)
     numbers = [int(row["video_id"]) for row in rows]
     several = tracking.with_several_methods(numbers)
-    seen: dict[tuple[int, str], list[int]] = {}
-    for one in rows_inside(tracking.Tracking.Person.proj(), "video_id", numbers):
-        seen.setdefault((int(one["video_id"]), one["tracking_method"]), []).append(int(one["person_id"]))
+    people = rows_inside(tracking.Tracking.Person.proj(), "video_id", numbers)
+    seen = grouped(((int(r["video_id"]), r["tracking_method"]), int(r["person_id"])) for r in people)
     out = []
     for row in rows:
         key = {k: row[k] for k in ("video_id", "tracking_method")}

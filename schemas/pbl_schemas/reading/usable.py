@@ -14,7 +14,7 @@ from pbl_pipeline.words import TASKS
 from .. import fit, gait, keypoints, video
 from ..capture import PhoneRecording
 from ..datajoint_setup import dj
-from ..rows import inside
+from ..rows import grouped, inside
 from .shown import shown_visit
 from .why import Why, whys
 
@@ -92,9 +92,7 @@ def verdicts(videos: Collection[int]) -> dict[int, Usable]:
         return {}
     where = inside("video_id", videos)
     marks = {int(r["video_id"]): r["unusable_reason"] for r in (video.NotUsable & where).to_dicts()}
-    checks: dict[int, list[dict[str, Any]]] = {}
-    for row in (keypoints.Keypoints.Check & where).to_dicts(order_by="KEY"):
-        checks.setdefault(int(row["video_id"]), []).append(row)
+    checks = grouped((int(r["video_id"]), r) for r in (keypoints.Keypoints.Check & where).to_dicts(order_by="KEY"))
     found, done = _found(where), video.conditions(where)
     left = [v for v in videos if v not in marks]
     states = whys(v for v in left if v not in found)

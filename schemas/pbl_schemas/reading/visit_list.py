@@ -25,7 +25,7 @@ from ..decisions.review_decisions import accepted_sql, is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision
-from ..rows import inside, parts
+from ..rows import grouped, inside, parts
 from .filming import filming_of
 from .status import queue_name, queues
 
@@ -150,9 +150,8 @@ def choices() -> dict[str, list[str]]:
 def earlier_result(session_id: int) -> Result | None:
     """Return the newest result of a part of the recordings that a current set of the visit has; None without one."""
     videos = fit.FitSet.Video & (fit.FitSet & {"session_id": session_id}).proj()
-    members: dict[str, set[int]] = {}
-    for row in videos.proj().to_dicts():
-        members.setdefault(row["fit_set"], set()).add(int(row["video_id"]))
+    of_sets = grouped((row["fit_set"], int(row["video_id"])) for row in videos.proj().to_dicts())
+    members = {name: set(own) for name, own in of_sets.items()}
     now = [members[name] for name in set((fit.current() & inside("fit_set", members)).to_arrays("fit_set"))]
     older = [name for name, own in members.items() if any(own < every for every in now)]
     return next(iter(results_of([session_id], older)[session_id]), None) if older else None
@@ -212,10 +211,9 @@ def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
     """Return the open checks (WARN, not accepted) of the results of these visits of which at least one was accepted
     since they were computed, by the key of the result."""
-    accepted: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
-        about = row["decision_about"]
-        accepted.setdefault(tuple(str(about[k]) for k in _RESULT), []).append(about)
+    decisions = (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts()
+    abouts = (row["decision_about"] for row in decisions)
+    accepted = grouped((tuple(str(about[k]) for k in _RESULT), about) for about in abouts)
     checks: dict[tuple[str, ...], list[dict[str, Any]]] = {of: [] for of in accepted}
     asking = qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & {"qc_check_outcome": "WARN"}
     for row in (asking & inside("fit_set", {of[0] for of in accepted})).to_dicts():
@@ -426,10 +424,8 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
     for i, day, label, subject in others:
         indexed[str(subject)] += [((int(i), day, str(label)), r) for r in results[int(i)] if r.index is not None]
     listed = _places(ids)
-    counted = (
-        f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed}) GROUP BY session_id"
-    )
-    videos = dict(_ask(counted, ids))
+    counted = f"SELECT session_id, COUNT(*) FROM {_name(video.Video)} WHERE session_id IN ({listed})"
+    videos = dict(_ask(f"{counted} GROUP BY session_id", ids))
     waiting = {int(s) for (s,) in _ask(f"{_waiting()} AND o.session_id IN ({listed})", ids)}
     empty, unusable = (
         {int(s) for (s,) in _ask(f"SELECT session_id FROM ({question}) x WHERE session_id IN ({listed})", ids)}

@@ -24,7 +24,7 @@ from ..job_errors import stored_error
 from ..jobs import jobs_of
 from ..method_names import with_keys
 from ..operations.archive import plain_name
-from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
+from ..rows import ReadAhead, Rows, grouped, inside, row_of, stored_rows
 from ..stored_files import file_ref, read_stored
 from .objects import (
     load_fit_checks,
@@ -142,10 +142,8 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     found = {
         (r["fit_set"], r["fit_method"]): r for r in fits.to_dicts(order_by="subject, session_id, fit_set, fit_method")
     }
-    measured: dict[tuple, list[dict[str, Any]]] = {}
     of_sets = (gdi.SessionGdi.proj() & sets.proj() & restriction).to_dicts(order_by="KEY")
-    for row in of_sets:
-        measured.setdefault((row["fit_set"], row["fit_method"]), []).append(row)
+    measured = grouped(((row["fit_set"], row["fit_method"]), row) for row in of_sets)
     visits = [{**row, **more} for key, row in found.items() for more in measured.get(key, [{}])]
     if not visits:
         raise PblError(
@@ -180,10 +178,8 @@ def load_visits(
     """
     for start in range(0, len(listed), _TOGETHER):
         some = listed[start : start + _TOGETHER]
-        of_sessions: dict[int, list[dict[str, Any]]] = {}
         videos = video.Video & inside("session_id", {int(v["session_id"]) for v in some})
-        for row in videos.to_dicts(order_by="video_id"):
-            of_sessions.setdefault(int(row["session_id"]), []).append(row)
+        of_sessions = grouped((int(row["session_id"]), row) for row in videos.to_dicts(order_by="video_id"))
         rows = ReadAhead(some, [int(r["video_id"]) for of_one in of_sessions.values() for r in of_one])
         for one in some:
             try:

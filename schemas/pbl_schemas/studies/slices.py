@@ -25,7 +25,7 @@ from ..method_names import with_keys
 from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..reading.slice_rows import slice_row
-from ..rows import PART, insert_in_parts, inside, rows_inside, utc_now
+from ..rows import PART, grouped, insert_in_parts, inside, rows_inside, utc_now
 from ..stored_files import file_ref, read_stored
 from ..transactions import in_transaction
 
@@ -202,13 +202,12 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
         {**chain, "session_id": int(r["session_id"]), "fit_set": r["fit_set"]} for r in with_set.to_dict("records")
     ]
     filmed = dict(zip(with_set["session_id"], filming_of(results), strict=True))
-    own: dict[int, list[int]] = defaultdict(list)
-    for row in rows_inside(video.Video.proj("session_id"), "session_id", map(int, rows["session_id"])):
-        own[int(row["session_id"])].append(int(row["video_id"]))
+    of_visits = rows_inside(video.Video.proj("session_id"), "session_id", map(int, rows["session_id"]))
+    own = grouped((int(row["session_id"]), int(row["video_id"])) for row in of_visits)
     marked = {n: UNUSABLE[mark.reason] for n, mark in unusable(v for of in own.values() for v in of).items()}
     out = []
     for row in rows.to_dict("records"):
-        videos = own[int(row["session_id"])]
+        videos = own.get(int(row["session_id"]), [])
         reasons = Counter(marked[v] for v in videos if v in marked)
         how = filmed.get(row["session_id"], Filming())
         parts = {"views": how.views, "cameras": how.cameras, "pictures": how.pictures, "height": how.height}

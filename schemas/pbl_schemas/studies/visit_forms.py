@@ -38,18 +38,8 @@ ACTIVITY, PACE = "activity:", "pace:"
 #: Fields that are numbers, and their checks.
 _NUMBERS = {"height_m": check_height, "mass_kg": check_mass}
 #: Kind of decision by the first part of a field's name.
-_KINDS = {
-    "date": "date",
-    "height_m": "height",
-    "mass_kg": "mass",
-    "population": "population",
-    "assistive_device": "aid",
-    "orthosis": "orthosis",
-    "activity": "activity",
-    "pace": "pace",
-}
-
-
+_KINDS = {name: name for name in ("date", "population", "orthosis", "activity", "pace")}
+_KINDS |= {"height_m": "height", "mass_kg": "mass", "assistive_device": "aid"}
 #: Name of the field of the role; those of scores are named by their instruments.
 ROLE = "role"
 #: Roles that are offered; any word of small letters, digits and underscores can be one.
@@ -85,10 +75,9 @@ class Form:
 
     def same(self, name: str, text: str) -> bool:
         """Return whether a text is the stored value, also in another notation: 1,80 for 1.8."""
+        old = self.values[name]
         try:
-            return iso_label(text) == self.values[name] or self.stored(name, text) == self.stored(
-                name, self.values[name]
-            )
+            return iso_label(text) == old or self.stored(name, text) == self.stored(name, old)
         except PblError:
             return False
 
@@ -114,10 +103,7 @@ def _check_visit(label: str) -> None:
 
 
 def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
-    errors: dict[str, PblError] = {}
-    for name in ("subject", "visit"):
-        if name not in given:
-            errors[name] = refused("an empty field", "a value", "write it", name)
+    errors = {n: refused("an empty field", "a value", "write it", n) for n in ("subject", "visit") if n not in given}
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": _check_visit,
@@ -210,9 +196,8 @@ def correct_facts(
     seen
         `Form.seen` of the form that was filled in.
     """
-    return in_transaction(
-        lambda: _correct(_locked(facts_form, session_id, values, seen), _stripped(values), by, reason)
-    )
+    given = _stripped(values)
+    return in_transaction(lambda: _correct(_locked(facts_form, session_id, values, seen), given, by, reason))
 
 
 def enter_scores(

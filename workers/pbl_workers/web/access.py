@@ -5,6 +5,7 @@ A request passes `Gate`, which finds its session, and then the right of its addr
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hmac
 import ipaddress
@@ -250,10 +251,8 @@ def host_name(stated: str) -> str:
     """Return a name or address as a browser sends it in a Host header: lower case, other letters than a to z as DNS
     has them (IDNA), addresses in their short form. Raises `PblError` USAGE for what is neither."""
     text = stated.strip().rstrip(".").removeprefix("[").removesuffix("]")
-    try:
+    with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(text))
-    except ValueError:
-        pass
     try:
         name = text.encode("idna").decode().lower()
     except UnicodeError:

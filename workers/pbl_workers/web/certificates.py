@@ -3,6 +3,7 @@ server's certificate, which it signs and which is renewed automatically."""
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import ipaddress
 import secrets
@@ -38,12 +39,9 @@ def authority() -> Path:
 def own_names() -> tuple[str, ...]:
     """Return the names under which phones of the same network reach this machine: its address and its name."""
     names = [socket.gethostname()]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        try:
-            asked.connect(("192.0.2.1", 9))  # chooses the way to other machines; nothing is sent
-            names.insert(0, asked.getsockname()[0])
-        except OSError:
-            pass
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked, contextlib.suppress(OSError):
+        asked.connect(("192.0.2.1", 9))  # chooses the way to other machines; nothing is sent
+        names.insert(0, asked.getsockname()[0])
     return tuple(dict.fromkeys(names))
 
 

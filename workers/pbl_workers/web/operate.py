@@ -17,6 +17,7 @@ from pbl_schemas import fit
 from pbl_schemas.decisions import review_decisions
 from pbl_schemas.operations.server_status import database_status
 from pbl_schemas.reading.status import ErrorRow, pipeline_status, running, span
+from pbl_schemas.rows import grouped
 from pbl_schemas.transactions import in_transaction
 
 from ..requeue import retry
@@ -69,9 +70,7 @@ ROUTES = [
 
 def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:
     """Return errors by table and code, the most first."""
-    found: dict[tuple[str, str], list[ErrorRow]] = {}
-    for error in errors:
-        found.setdefault((error.table, error.code), []).append(error)
+    found = grouped(((error.table, error.code), error) for error in errors)
     made = [Group(table, code, tuple(rows)) for (table, code), rows in found.items()]
     return sorted(made, key=lambda g: -len(g.errors))
 

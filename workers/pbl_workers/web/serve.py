@@ -17,7 +17,7 @@ import click
 import uvicorn
 
 from pbl_pipeline import settings
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, suppress_codes
 from pbl_pipeline.names import check_label
 
 from .access import Sessions, host_name
@@ -224,14 +224,11 @@ def database() -> Iterator[None]:
     if started:
         embedded.start(say=click.echo)
     try:
-        try:
+        with suppress_codes("DB_NOT_RUNNING"):
             connection.connect()
             if not catalog.schemas():
                 click.echo("Creating the tables and the method rows of this version")
             pbl_schemas.activate(methods=False)
-        except PblError as error:
-            if error.code != "DB_NOT_RUNNING":
-                raise
         yield
     finally:
         if started:

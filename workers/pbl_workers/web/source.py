@@ -10,7 +10,7 @@ from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import suppress_codes
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import UNUSABLE
 from pbl_schemas import fit, privacy, video
@@ -50,9 +50,7 @@ class Videos:
     """
 
     def __init__(self) -> None:
-        self._open: collections.OrderedDict[tuple[int, str], tuple[Path, contextlib.ExitStack]] = (
-            collections.OrderedDict()
-        )
+        self._open = collections.OrderedDict[tuple[int, str], tuple[Path, contextlib.ExitStack]]()
         self._lock = threading.Lock()
 
     def path(self, video_id: int) -> Path:
@@ -151,12 +149,9 @@ class TablesSource:
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
         """Return as `Source.people`; nothing before people are searched."""
-        try:
+        found: list[candidates.Candidates] = []
+        with suppress_codes("DB_NOT_FOUND"):
             found = candidates.candidates(about.number)
-        except PblError as error:
-            if error.code != "DB_NOT_FOUND":
-                raise
-            return [], []
         return found, [review_decisions.person_state(about.number, c.key["tracking_method"]) for c in found]
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:

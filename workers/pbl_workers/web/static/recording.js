@@ -1,7 +1,7 @@
 // The player of a recording: the fitted body over the video, curves and events on one time line.
 // What is drawn follows the frame that the browser says it shows (requestVideoFrameCallback), never a clock beside it.
 
-import { Poses, drawBody } from "./body.js";
+import { Poses, among, drawBody } from "./body.js";
 
 /**
  * @typedef {{time: number[], size: [number, number], events: [number, string, string, number][],
@@ -22,7 +22,6 @@ export function frameAt(times, at) {
   return low;
 }
 
-const within = (spans, at) => spans.some(([from, to]) => from <= at && at <= to);
 const $ = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
 /** A time (s) as the page's language writes it. @param {number} time */
 export const seconds = (time) => time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false });
@@ -114,7 +113,7 @@ function charts(m, seek) {
       const data = [m.time], series = [{}], bands = [];
       for (const side of ["left", "right"]) {
         if (!curve[side]) continue;
-        const unsure = m.time.map((t) => within(m.uncertain[side], t)), { value, half } = curve[side], ink = colour(side);
+        const unsure = m.time.map((t) => among(m.uncertain[side], t)), { value, half } = curve[side], ink = colour(side);
         const edge = (sign) => value.map((v, i) => (v === null || half[i] === null ? null : v + sign * half[i]));
         bands.push({ series: [series.length, series.length + 1], fill: ink + "30" });
         for (const sign of [1, -1]) { series.push({ stroke: "transparent", width: 0, points: { show: false } }); data.push(edge(sign)); }
