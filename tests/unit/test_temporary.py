@@ -10,6 +10,7 @@ import sys
 import tempfile
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,7 +51,7 @@ def test_what_a_killed_process_left_goes_with_the_next_command(folder: Path, wha
 @pytest.mark.parametrize("how", [m for m in multiprocessing.get_all_start_methods() if m != "fork"])
 def test_a_process_that_ends_leaves_none(how: str):
     """Python runs `atexit` at the end of a forked process from 3.13 on."""
-    context = multiprocessing.get_context(how)
+    context: Any = multiprocessing.get_context(how)
     here, there = context.Pipe()
     process = context.Process(target=_keeps, args=[there])
     process.start()

@@ -7,7 +7,7 @@ import signal
 from pbl_pipeline.resources import fewer_collections
 
 fewer_collections()
-# A terminal and systemd send them to all processes; the supervisor decides. What it sends to a copy waits for `begin`.
+# A terminal and systemd send them to all processes; the supervisor decides. Its SIGTERM to a copy waits for `begin`.
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
