@@ -88,8 +88,8 @@ def style_of(impairments: tuple[Impairment, ...]) -> Style:
     return style
 
 
-#: Effect of an impairment of severity 1 on fields of `Style`: what is added, and the fraction of change. Of a field with
-#: two sides, on those that are affected.
+#: Effect of an impairment of severity 1 on fields of `Style`: what is added, and the fraction of change; of a field
+#: with two sides, on those that are affected.
 IMPAIRMENTS: dict[str, dict[str, tuple[float, float]]] = {
     "crouch": {"stance_knee": (32, 0), "stance_hip": (18, 0), "stance_ankle": (13, 0), "step_length": (0, -0.15)},
     "stiff_knee": {"swing_knee": (0, -0.7), "swing_abduction": (10, 0), "swing_hike": (5, 0), "step_length": (0, -0.1)},
