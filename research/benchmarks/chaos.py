@@ -4,11 +4,11 @@
     python -m research.benchmarks.chaos --minutes 10 --database mysql     # on Debian's MySQL (tests/mysql.py)
     python -m research.benchmarks.chaos --minutes 30 --people             # phones, decisions, forget, backups, cron
 
-Faults, one every few seconds: kill -9 of working processes, of supervisors, and of the database inside an insert,
-before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
-database; a full disk of the store and of the database. The supervisors act as separate machines, so that a paused
-process loses its job to another. Heavy stages give recorded results. The last lines compare what `pbl status` says with
-the results, and count the remains; exit status 1 where anything is wrong.
+Faults, one every few seconds: kill -9 of working processes, of those that they are forked from, of supervisors, and of
+the database inside an insert, before or after its statement; pauses of processes for longer than it takes until they
+count as dead, and of the database; a full disk of the store and of the database. The supervisors act as separate
+machines, so that a paused process loses its job to another. Heavy stages give recorded results. The last lines compare
+what `pbl status` says with the results, and count the remains; exit status 1 where anything is wrong.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ HOST, INSERTS = "PBL_BENCH_HOST", "PBL_BENCH_INSERTS"
 #: Seconds until a process without a heartbeat counts as dead here, and the longest pause of one.
 DEAD_S, PAUSE_S = 8.0, 20.0
 #: Sizes of the two disks (MiB): of what is recorded while it runs, and room.
-DISKS = {"db": lambda minutes: 600 + 20 * minutes, "store": lambda minutes: 40 + 12 * minutes}
+DISKS = {"db": lambda minutes: 600 + 20 * minutes, "store": lambda minutes: 40 + 40 * minutes}
 #: After so long `pbl status` has to be right (s), and everything is to be done (s).
 STATUS_S, DRAIN_S = 120.0, 900.0
 
@@ -142,7 +142,16 @@ class Site:
 
     def children(self) -> list[int]:
         """The working processes."""
-        return [child for b in self.bosses if (child := _child_of(b.pid))]
+        return [child for one in self.forked_from() for child in _children(one)]
+
+    def forked_from(self) -> list[int]:
+        """The process under each supervisor that its working process is forked from."""
+        return [child for b in self.bosses for child in _children(b.pid)]
+
+    def kill_forked_from(self) -> None:
+        if pids := self.forked_from():
+            os.kill(self.draw.choice(pids), signal.SIGKILL)
+            self.done["process that others are forked from killed"] += 1
 
     def kill_worker(self) -> None:
         if pids := self.children():
@@ -204,19 +213,21 @@ class Site:
         self.done[f"disk of the {disk} full"] += 1
 
 
-def _child_of(pid: int) -> int:
-    """The working process under a supervisor; 0 where it has none at the moment."""
+def _children(pid: int) -> list[int]:
+    """The process under a supervisor that others are forked from, or those that are forked from it."""
+    found = []
     with contextlib.suppress(OSError):
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return int(child)
-    return 0
+            if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.append(int(child))
+    return found
 
 
 def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:
     full = 1.0 if can_fill else 0.0
     return [
         (4.0, site.kill_worker),
+        (0.5, site.kill_forked_from),
         (1.0, site.kill_supervisor),
         (2.0, site.pause_worker),
         (0.5, site.pause_server),
