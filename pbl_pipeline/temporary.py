@@ -12,7 +12,6 @@ import secrets
 import shutil
 import tempfile
 import time
-from multiprocessing.util import Finalize
 from pathlib import Path
 
 #: Names begin with this; the number of the process and a random word follow, because the processes of a container that
@@ -26,6 +25,8 @@ class TemporaryFolder(tempfile.TemporaryDirectory[str]):
     """A folder that is removed at the end of its `with` block, by `cleanup()`, or when no one holds the object."""
 
     def __init__(self, beside: Path | None, prefix: str) -> None:
+        from multiprocessing.util import Finalize  # here: most commands make no folder
+
         super().__init__(dir=beside, prefix=prefix)
         # At the end of a forked process, in which Python runs `atexit` from 3.13 on.
         Finalize(self, shutil.rmtree, (self.name, True), exitpriority=0)

@@ -66,9 +66,11 @@ def _copies_of(module: str) -> Iterator[None]:
     others = copied._preload_modules
     copied._stop()
     copied.set_forkserver_preload([module])
-    yield
-    copied._stop()
-    copied.set_forkserver_preload(others)
+    try:
+        yield
+    finally:
+        copied._stop()
+        copied.set_forkserver_preload(others)
 
 
 @dataclasses.dataclass
